@@ -122,7 +122,7 @@ class Run:
     def _photographs(self) -> Path:
         """Name what cannot be read, and return the folder of the scene: that of the photographs if it has cameras."""
         from reference_trainer.evaluation.results import write_json
-        from reference_trainer.scenes.load import find_format  # from where all formats are known
+        from reference_trainer.scenes.load import find_reader  # from where all formats are known
         from reference_trainer.scenes.photographs import collect_photographs, is_video, sort_photographs
 
         sources, wrong = sort_photographs(self.photos)
@@ -130,7 +130,7 @@ class Run:
             print(f"not read, and left out: {'' if name in why else f'{name}: '}{why}", file=sys.stderr)
         scene, mark = self.folder / SCENE / self.photos.resolve().stem, self.folder / MARK
         with suppress(ValueError, FileNotFoundError):
-            find_format(self.photos, "auto")
+            find_reader(self.photos, "auto")
             scene = self.photos
         if scene != self.photos and find_spec("pycolmap") is None:
             raise ImportError("these photographs have no cameras, and finding them needs pip install 'ca_reg[colmap]'.")
@@ -157,10 +157,10 @@ class Run:
     def _sizes(self, scene: Path) -> tuple[tuple[int, int], int]:
         """Return width and height of the largest photograph, and how many there are, placed or not."""
         from reference_trainer.scenes.images import image_size, list_images
-        from reference_trainer.scenes.load import find_format
+        from reference_trainer.scenes.load import find_reader
 
         if scene == self.photos:
-            paths = [frame.path for frame in find_format(scene, "auto")[1](scene, SceneOptions(str(scene))).frames]
+            paths = [frame.path for frame in find_reader(scene, "auto")(scene, SceneOptions(str(scene))).frames]
         else:
             paths = list_images(scene / "images")
         return max(map(image_size, paths), key=math.prod), len(paths)

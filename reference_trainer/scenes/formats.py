@@ -17,7 +17,7 @@ from reference_trainer.scenes.images import is_image
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud
 
-__all__ = ["Capture", "Reader", "SceneFormat", "find_format", "only_default", "register_format"]
+__all__ = ["Capture", "Reader", "SceneFormat", "find_reader", "only_default", "register_format"]
 
 
 @dataclass(frozen=True)
@@ -76,15 +76,17 @@ def register_format(format: SceneFormat) -> None:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = Path(folder, "toy.txt").write_text("a camera")
-        ...     find_format(Path(folder), "auto")[0]
-        'toy'
+        ...     find_reader(Path(folder), "auto") is toy.read
+        True
         >>> del _FORMATS["toy"]
     """
     _FORMATS[format.name] = format
 
 
-def find_format(root: Path, name: str) -> tuple[str, Reader]:
-    """Return the name and reader of the named format, or for ``"auto"`` of the first that fits the folder.
+def find_reader(root: Path, name: str) -> Reader:
+    """Return the reader of the named format, or for ``"auto"`` of the first that fits the folder.
+
+    ``module:function`` names a user's own, whose module may lie in the working directory.
 
     Raises:
         FileNotFoundError: if there is no such folder.
@@ -92,12 +94,17 @@ def find_format(root: Path, name: str) -> tuple[str, Reader]:
     """
     if not root.is_dir():
         raise FileNotFoundError(f"there is no scene folder {root}; for the built-in scene, say 'synthetic'.")
-    if ":" in name:
-        return name, _imported(name)
+    module, colon, function = name.partition(":")
+    if colon:
+        try:
+            reader: Reader = imported(module, function)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"format {name!r} must name a function (root, options) -> Capture: {error}.") from error
+        return reader
     if name == "auto":
         name = next((format.name for format in _FORMATS.values() if format.found(root)), name)
     if name in _FORMATS:
-        return name, _FORMATS[name].read
+        return _FORMATS[name].read
     if name != "auto":
         raise ValueError(f"format must be auto, module:function or one of {', '.join(_FORMATS)}, got {name!r}.")
     if any(map(is_image, (*root.glob("*"), *root.glob("images/*")))):
@@ -109,16 +116,6 @@ def find_format(root: Path, name: str) -> tuple[str, Reader]:
         f"{root} has none of {', '.join(format.sign for format in _FORMATS.values())}; it has "
         f"{sorted(entry.name for entry in root.iterdir())[:20]}."
     )
-
-
-def _imported(name: str) -> Reader:
-    """Import a reader from a user's module, which may lie in the working directory."""
-    module, _, attribute = name.partition(":")
-    try:
-        reader: Reader = imported(module, attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"format {name!r} must name a function (root, options) -> Capture: {error}.") from error
-    return reader
 
 
 def only_default(format: str, **options: object) -> None:

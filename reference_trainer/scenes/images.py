@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 __all__ = [
-    "check_image", "composite", "image_size", "is_image", "list_images", "match_images", "opened_image",
+    "composite", "decode_image", "image_size", "is_image", "list_images", "match_images", "opened_image",
     "path_inside", "picture_folder", "read_image", "resize_image", "unreadable_photographs",
 ]  # fmt: skip
 
@@ -43,7 +43,7 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
         ValueError: if the file is not an image, is damaged, has more than 8 bits per channel or more than 100 million
             pixels.
     """
-    picture = _decoded(path)
+    picture = decode_image(path)
     width, height, has_alpha = picture.width, picture.height, picture.mode == "RGBA"
     image = torch.empty(3, height, width)
     alpha = torch.empty(height, width) if has_alpha else None
@@ -57,13 +57,8 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
     return image, alpha
 
 
-def check_image(path: str | Path) -> None:
-    """Decode an image file to its end, for those who hand it to another program; errors as for `read_image`."""
-    _decoded(path)
-
-
-def _decoded(path: str | Path) -> Any:
-    """Return the picture of an image file, RGBA if it has transparency, else RGB; errors as for `read_image`."""
+def decode_image(path: str | Path) -> Any:
+    """Return an image file, decoded to its end, as a Pillow image, RGBA or RGB; errors as for `read_image`."""
     with opened_image(path) as file:
         mode, width, height = file.mode, file.width, file.height
         file.verify()  # checks a PNG's checksums, which decoding does not

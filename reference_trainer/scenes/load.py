@@ -16,7 +16,7 @@ from reference_trainer.json_files import read_json
 from reference_trainer.scenes.colmap import COLMAP
 from reference_trainer.scenes.dense import dense_start
 from reference_trainer.scenes.depth import point_prior, true_priors, with_prior
-from reference_trainer.scenes.formats import Capture, find_format, only_default, register_format
+from reference_trainer.scenes.formats import Capture, find_reader, only_default, register_format
 from reference_trainer.scenes.frames import Frame, corner_displacement, load_view
 from reference_trainer.scenes.images import LARGE_PICTURE, image_size, unreadable_photographs
 from reference_trainer.scenes.numpy_formats import ARRAYS, IDR, LLFF
@@ -26,7 +26,7 @@ from reference_trainer.scenes.scene import Scene
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.scenes.transforms import BLENDER, TRANSFORMS
 
-__all__ = ["blender_split", "dtu_split", "evenly_spaced", "file_split", "find_format", "llff_split", "load_scene"]
+__all__ = ["blender_split", "dtu_split", "evenly_spaced", "file_split", "find_reader", "llff_split", "load_scene"]
 
 # The order matters: of several formats that fit a folder, the first counts.
 for _format in (BLENDER, IDR, COLMAP, TRANSFORMS, LLFF, ARRAYS):
@@ -67,8 +67,7 @@ def load_scene(options: SceneOptions, *, seed: int = 0) -> Scene:
     if options.path == "synthetic":
         return _built_in(options, seed)
     root = Path(options.path)
-    _, read = find_format(root, options.format)
-    capture = read(root, options)
+    capture = find_reader(root, options.format)(root, options)
     train, test = _split(root, capture, options)
     trained = [frame.name for frame in train]
     held_out = {frame.name for frame in [*capture.frames, *(capture.test or [])]} - set(trained)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from reference_trainer.files import replacing
-from reference_trainer.scenes.images import FORMATS, OTHER_PHOTOGRAPHS, check_image, is_image, opened_image
+from reference_trainer.scenes.images import FORMATS, OTHER_PHOTOGRAPHS, decode_image, is_image, opened_image
 
 __all__ = ["collect_photographs", "is_video", "sharpest_frames", "sort_photographs"]
 
@@ -54,7 +54,7 @@ def sort_photographs(source: Path) -> tuple[list[Path], dict[str, str]]:
             elif kind in HEIC:
                 _upright(path)
             elif is_image(path):
-                check_image(path)
+                decode_image(path)
             elif kind in OTHER_PHOTOGRAPHS:
                 raise ValueError(f"{kind[1:].upper()} is not read: save it as JPEG or PNG")
             else:

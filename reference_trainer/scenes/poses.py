@@ -18,7 +18,7 @@ from typing import Any
 from reference_trainer.progress import progress_bar
 from reference_trainer.scenes._colmap_model import CAMERA_MODELS
 from reference_trainer.scenes.colmap import colmap_folders
-from reference_trainer.scenes.images import check_image, image_size, list_images, unreadable_photographs
+from reference_trainer.scenes.images import decode_image, image_size, list_images, unreadable_photographs
 
 __all__ = ["FoundPoses", "find_poses"]
 
@@ -100,7 +100,7 @@ def find_poses(
     if found := colmap_folders(out):
         raise FileExistsError(f"{out} has cameras already, in {found[0]}: train on it, or delete them to find others.")
     for photo in photos:
-        check_image(photo)  # COLMAP takes what is left of a truncated one
+        decode_image(photo)  # COLMAP takes what is left of a truncated one
     with tempfile.TemporaryDirectory() as work:
         model = _reconstruct(photos, Path(work), camera, seed, progress)
         if model is None:

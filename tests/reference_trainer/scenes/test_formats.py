@@ -12,8 +12,8 @@ import torch
 
 from reference_trainer.cli import main
 from reference_trainer.scenes import SceneFormat, formats, load_scene, register_format
-from reference_trainer.scenes.formats import find_format
-from reference_trainer.scenes.numpy_formats import read_idr
+from reference_trainer.scenes.formats import find_reader
+from reference_trainer.scenes.numpy_formats import IDR, read_idr
 from reference_trainer.scenes.options import SceneOptions
 
 PICTURES = ("a b.png", "b.png", "c.png")
@@ -58,7 +58,7 @@ def test_a_format_of_the_users_own_trains(photographs, tmp_path, monkeypatch, ho
         exec(TOY, scope)
         register_format(SceneFormat("toy", "toy.txt", lambda root: (root / "toy.txt").is_file(), scope["read"]))
         arguments = []
-        assert find_format(photographs, "auto")[0] == "toy"
+        assert find_reader(photographs, "auto") is scope["read"]
     main(["train", "--path", str(photographs), "--out", str(tmp_path / "run"), "--iterations", "2", "--downscale", "4",
           "--points", "random:50", "--monitor-every", "0", *arguments])  # fmt: skip
     results = json.loads((tmp_path / "run" / "results.json").read_text())
@@ -168,7 +168,7 @@ def test_points_that_are_not_there_are_no_obstacle_to_others(nerfstudio):
         FileNotFoundError, match=r"transforms\.json names the points .*sparse_pc\.ply, .* --points random"
     ):
         load_scene(SceneOptions(nerfstudio))
-    _, read = find_format(nerfstudio, "auto")
+    read = find_reader(nerfstudio, "auto")
     assert read(nerfstudio, SceneOptions(nerfstudio, points="random")).points is None
 
 
@@ -266,7 +266,7 @@ def test_idr(photographs, save_image, subset):
             save_image(photographs / "image" / f"{i:06}.png", rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
             save_image(photographs / "mask" / f"{i:03}.png", np.full((48, 64), 255 * (i == 2), np.uint8))
     np.savez_compressed(photographs / "cameras_sphere.npz", **arrays)
-    assert find_format(photographs, "auto")[0] == "idr"
+    assert find_reader(photographs, "auto") is IDR.read
     frames = read_idr(photographs / "cameras_sphere.npz", photographs / "image")
     assert [frame.name for frame in frames] == [name for name in expected if not (subset and "1" in name)]
     for frame in frames:

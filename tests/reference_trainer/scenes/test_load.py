@@ -10,9 +10,11 @@ import torch
 from PIL import Image
 
 from reference_trainer.scenes import load_scene
-from reference_trainer.scenes.colmap import colmap_frames, read_colmap
-from reference_trainer.scenes.formats import find_format
+from reference_trainer.scenes.colmap import COLMAP, colmap_frames, read_colmap
+from reference_trainer.scenes.formats import find_reader
+from reference_trainer.scenes.numpy_formats import LLFF
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.transforms import BLENDER
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.plan import make_plan
 
@@ -175,16 +177,16 @@ def test_synthetic_scene_by_name():
 
 
 def test_detect_format(photo_scene, blender_scene, tmp_path):
-    assert find_format(photo_scene, "auto")[0] == "colmap"
-    assert find_format(blender_scene, "auto")[0] == "blender"
+    assert find_reader(photo_scene, "auto") is COLMAP.read
+    assert find_reader(blender_scene, "auto") is BLENDER.read
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").touch()
     with pytest.raises(ValueError, match=r"none of transforms_train\.json.*notes\.txt"):
-        find_format(tmp_path / "other", "auto")
+        find_reader(tmp_path / "other", "auto")
     (tmp_path / "other" / "poses_bounds.npy").touch()
-    assert find_format(tmp_path / "other", "auto")[0] == "llff"
+    assert find_reader(tmp_path / "other", "auto") is LLFF.read
     with pytest.raises(FileNotFoundError, match="say 'synthetic'"):
-        find_format(tmp_path / "none", "auto")
+        find_reader(tmp_path / "none", "auto")
 
 
 @pytest.mark.parametrize(
