@@ -31,20 +31,17 @@ def make_module(name: str, **members: Any) -> ModuleType:
 class Refusing:
     """Takes the place of compiled code that is imported; its use raises RuntimeError, its import alone does not."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self, name: str, advice: str = "run without --cpu, or switch off what calls it") -> None:
+        self._name, self._advice = name, advice
 
     def __getattr__(self, attribute: str) -> Any:
         if attribute.startswith("__"):
             raise AttributeError(attribute)
-        return Refusing(f"{self._name}.{attribute}")
+        return Refusing(f"{self._name}.{attribute}", self._advice)
 
     def __call__(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Refuse."""
-        raise RuntimeError(
-            f"{self._name} is compiled code, which needs CUDA and has no stand-in here: run without --cpu, or switch "
-            "off what calls it."
-        )
+        raise RuntimeError(f"{self._name} is compiled code, which needs CUDA and has no stand-in here: {self._advice}.")
 
 
 def distCUDA2(points: Tensor) -> Tensor | tuple[Tensor, Tensor]:

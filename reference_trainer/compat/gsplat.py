@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import ModuleType, SimpleNamespace
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ca_reg.integrations.gsplat import load_gsplat
 from reference_trainer.camera import Camera
+from reference_trainer.compat.extensions import Refusing, make_module
 from reference_trainer.compat.planes import filtered
 from reference_trainer.model.gaussians import compute_relocation
 from reference_trainer.render import Splats, rasterize, splat
@@ -35,6 +36,7 @@ WITHOUT_EFFECT = {"tile_size", "channel_chunk", "segmented", "sparse_grad", "ut_
 NEAREST = 1e-6  # a nearer near plane is taken for this one
 EXTENT = 3.33  # standard deviations at which an opaque splat has faded to `MIN_ALPHA`
 SMALLEST_SPREAD = 0.1  # px^2, of gsplat 1.4
+ADVICE = "on a CPU gsplat.rasterization runs, and with it the default and the MCMC strategy"
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
@@ -232,7 +234,8 @@ def gsplat_functions() -> Iterator[None]:
         ImportError: if gsplat is missing or too old.
     """
     with ExitStack() as undo:
-        for name, module in {"gsplat.csrc": _no_kernels(), "gsplat.cuda._backend": None}.items():
+        kernels = make_module("gsplat.csrc", __getattr__=Refusing("gsplat", ADVICE).__getattr__)
+        for name, module in {"gsplat.csrc": kernels, "gsplat.cuda._backend": None}.items():
             undo.callback(_put_module, name, sys.modules.get(name))
             _put_module(name, module)
         gsplat = load_gsplat()
@@ -240,9 +243,9 @@ def gsplat_functions() -> Iterator[None]:
             importlib.import_module(f"gsplat.{name}") for name in ("rendering", "relocation", "distributed")
         )
         original = rendering.rasterization
-        stand_ins = {
+        stand_ins: dict[Callable[..., Any], Callable[..., Any]] = {
             original: make_rasterization(original, per_axis=_per_axis(gsplat.__version__)),
-            rendering.rasterization_2dgs: _refusing(rendering.rasterization_2dgs),
+            rendering.rasterization_2dgs: Refusing("gsplat.rasterization_2dgs", ADVICE),
             relocation.compute_relocation: compute_relocation,
             gsplat.quat_scale_to_covar_preci: quat_scale_to_covar_preci,
             distributed.cli: _run_once,
@@ -261,34 +264,6 @@ def _put_module(name: str, module: ModuleType | None) -> None:
         sys.modules.pop(name, None)
     else:
         sys.modules[name] = module
-
-
-def _no_kernels() -> ModuleType:
-    """Make a module in place of the missing compiled code."""
-
-    def refuse(name: str) -> NoReturn:
-        raise AttributeError(name) if name.startswith("__") else _without_cuda(name)
-
-    module = ModuleType("gsplat.csrc")
-    module.__getattr__ = refuse  # type: ignore[method-assign]
-    return module
-
-
-def _refusing(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function with the same signature that raises, as it needs CUDA."""
-
-    @functools.wraps(function)
-    def refuse(*args: Any, **kwargs: Any) -> NoReturn:
-        raise _without_cuda(function.__name__)
-
-    return refuse
-
-
-def _without_cuda(name: str) -> RuntimeError:
-    return RuntimeError(
-        f"gsplat's {name} needs CUDA, and has no stand-in here. On a CPU gsplat.rasterization runs, and with it the "
-        "default and the MCMC strategy."
-    )
 
 
 def _run_once(fn: Callable[..., Any], args: Any, verbose: bool = False) -> bool:
