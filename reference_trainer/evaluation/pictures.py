@@ -156,12 +156,12 @@ def heat_colors(values: Tensor, low: float, high: float) -> Tensor:
 
 
 @cache
-def label_font(size: int = _TEXT) -> Any:
-    """Return the font of labels in pictures for Pillow: matplotlib's DejaVu Sans, ``size`` pixels high."""
+def label_font() -> Any:
+    """Return the font of labels in pictures for Pillow: matplotlib's DejaVu Sans."""
     import matplotlib
     from PIL import ImageFont
 
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")), size)
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts/ttf/DejaVuSans.ttf")), _TEXT)
 
 
 def color_bar(low: str, high: str, *, width: int) -> Tensor:

@@ -87,15 +87,11 @@ def summary(results: Mapping[str, Any]) -> str:
     return _table("views", rows, names)
 
 
-def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]], *, first: str = "strategy") -> str:
+def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     """Return one row per strategy with means and sample standard deviations over the seeds.
 
     Without test views, the exact CA at, between and around the training views takes the place of what is measured at
-    test views.
-
-    Args:
-        runs: for every strategy the content of ``results.json`` of each seed.
-        first: title of the first column; under "run" every row is a single one, and there is no column of seeds.
+    test views. ``runs`` holds for every strategy the content of ``results.json`` of each seed.
     """
     shown = {
         "test": ["psnr", "ssim", "lpips", "ca_exact_half", "cv", "depth_abs_rel"],
@@ -107,7 +103,7 @@ def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]], *, first: 
     columns = {f"{split} {_SHOWN[name][0]}": (split, name) for split, names in shown.items() for name in names}
     rows: list[dict[str, object]] = []
     for strategy, of in runs.items():
-        row: dict[str, object] = {first: strategy, "seeds": len(of)}
+        row: dict[str, object] = {"strategy": strategy, "seeds": len(of)}
         for title, (split, name) in columns.items():
             values = [run["mean"].get(split, {}).get(name) for run in of]
             if known := [value for value in values if value is not None]:
@@ -116,7 +112,7 @@ def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]], *, first: 
             row[_SHOWN[name][0]] = format_mean_std([run[name] for run in of], decimals=0)
         rows.append(row)
     present = [title for title in columns if any(title in row for row in rows)]
-    return markdown_table(rows, [first, *(["seeds"] if first != "run" else []), *present, "Gaussians", "seconds"])
+    return markdown_table(rows, ["strategy", "seeds", *present, "Gaussians", "seconds"])
 
 
 def mean_std(values: Iterable[float]) -> tuple[float, float]:
@@ -185,20 +181,16 @@ def markdown_table(rows: Sequence[Mapping[str, object]], columns: Sequence[str])
     return "\n".join([text[0], f"|{'|'.join(rule)}|", *text[1:], ""])
 
 
-def print_table(markdown: str, *, width: int | None = None) -> None:
+def print_table(markdown: str) -> None:
     """Print a Markdown table; to a terminal as one that fits its width, with the best models and strategies in bold.
 
     A table that is too wide is turned around if that helps: many quantities of few strategies are read as rows.
     Else its columns go on below.
-
-    Args:
-        markdown: from `markdown_table`.
-        width: of the terminal, in characters; by default found out.
     """
     if not sys.stdout.isatty():
         print(markdown, flush=True)
         return
-    width = width or shutil.get_terminal_size().columns
+    width = shutil.get_terminal_size().columns
     head, rule, *rows = [
         [cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
         for line in markdown.strip().splitlines()

@@ -112,11 +112,10 @@ def load_ply_model(
 
 
 def load_plain_ply_model(
-    ply: Path, *, regularizer: str | None = None, device: str = "cpu", trust: Collection[str] = ()
+    ply: Path, *, regularizer: str | None = None, device: str = "cpu"
 ) -> tuple[TrainedModel, PlyFacts]:
     """Do as `load_ply_model` over black, with a ValueError unless the opacities are plain."""
-    shared: dict[str, Any] = {"regularizer": regularizer, "device": device, "trust": trust}
-    model, facts = load_ply_model(ply, background=torch.zeros(3), **shared)
+    model, facts = load_ply_model(ply, background=torch.zeros(3), regularizer=regularizer, device=device)
     if facts.for_rendering or facts.opacity_scale != 1:
         by = "those of the test" if facts.for_rendering else f"scaled by {facts.opacity_scale:g}"
         raise ValueError(f"the opacities of {ply} are {by} already: give the PLY with plain ones.")

@@ -127,7 +127,8 @@ WIDE = markdown_table(
 def test_a_table_fits_the_terminal(width, capsys, monkeypatch):
     """Every figure is there and no line is longer; the best strategy is bold."""
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    print_table(WIDE, width=width)
+    monkeypatch.setenv("COLUMNS", str(width))
+    print_table(WIDE)
     out = capsys.readouterr().out
     plain = re.sub(r"\x1b\[[0-9;]*m", "", out)
     assert max(map(len, plain.splitlines())) <= width
@@ -141,8 +142,9 @@ def test_a_table_fits_the_terminal(width, capsys, monkeypatch):
 def test_a_table_of_many_columns_goes_on_below(names, capsys, monkeypatch):
     """Nothing is lost, however many rows there are; every part says which row is which."""
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
     rows = [{"view": name} | {f"quantity{j}": f"{i}.{j:02}" for j in range(30)} for i, name in enumerate(names)]
-    print_table(markdown_table(rows, list(rows[0])), width=80)
+    print_table(markdown_table(rows, list(rows[0])))
     plain = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
     assert max(map(len, plain.splitlines())) <= 80
     words = plain.split()
