@@ -11,7 +11,7 @@ from reference_trainer.scenes.frames import Frame
 from reference_trainer.scenes.images import match_images, picture_folder
 from reference_trainer.scenes.options import SceneOptions
 
-__all__ = ["COLMAP", "colmap_folders", "colmap_frames", "read_colmap"]
+__all__ = ["COLMAP", "colmap_folders", "colmap_frames", "is_colmap", "read_colmap"]
 
 
 def read_colmap(folder: str | Path) -> ColmapModel:
@@ -40,7 +40,12 @@ def colmap_folders(root: Path) -> list[Path]:
     ``sparse_<name>/0`` (InstantSplat, and clouds from the training views alone).
     """
     folders = [root / "sparse" / "0", root / "sparse", root, *sorted(root.glob("sparse_*/0"))]
-    return [folder for folder in folders if _has(folder, "cameras") and _has(folder, "images")]
+    return list(filter(is_colmap, folders))
+
+
+def is_colmap(folder: Path) -> bool:
+    """Whether a folder holds the cameras and images of a reconstruction."""
+    return _has(folder, "cameras") and _has(folder, "images")
 
 
 def colmap_frames(model: ColmapModel, folder: str | Path) -> list[Frame]:

@@ -14,7 +14,7 @@ from reference_trainer.files import is_ply
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.ply_files import PlyVertices, read_ply
-from reference_trainer.scenes.colmap import colmap_folders, read_colmap
+from reference_trainer.scenes.colmap import colmap_folders, is_colmap, read_colmap
 from reference_trainer.scenes.frames import Frame
 from reference_trainer.scenes.images import is_image, path_inside
 from reference_trainer.scenes.scene import PointCloud
@@ -67,7 +67,7 @@ def choose_points(
         if offered:
             passed = (
                 f"; the points from {', '.join(cloud.source for cloud in offered)} have seen views that do not train "
-                "(--test none holds none out; --points FOLDER --allow-test-points takes them all the same)"
+                "(with --test none and no --views all train; --points FOLDER --allow-test-points takes them anyway)"
             )
     if kind == "random":
         if count and not (count.isdecimal() and int(count) > 0):
@@ -75,11 +75,9 @@ def choose_points(
         cloud = random_points(train, int(count or RANDOM_POINTS), generator)
         return cloud, f"initial points: {len(cloud.positions):,} random ones{passed}"
     path = path_inside(root, points)
-    if not path.is_dir() and not is_ply(path):
+    if not is_colmap(path) and not is_ply(path):
         found = sorted(folder.relative_to(root).as_posix() for folder in colmap_folders(root))
-        raise FileNotFoundError(
-            f"there is no folder {path} to take points from; choose auto, random or one of {found}."
-        )
+        raise FileNotFoundError(f"there is no COLMAP model in {path}; choose auto, random, a .ply or one of {found}.")
     if own is not None and own.source == str(path):
         cloud = own  # in the world of the cameras, which its file need not be, and of known origin
     else:
