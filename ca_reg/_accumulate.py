@@ -9,6 +9,9 @@ from torch import Tensor
 
 from ca_reg._precision import at_least_single
 from ca_reg.result import Reason
+from ca_reg.types import ExactMoments
+
+__all__ = ["Deviations", "RenderMoments", "effect_of", "exact_mean", "finite_colors", "visible_mean"]
 
 MAX_ALPHA = 1.01  # above what rounding to 16 bits makes of an alpha of 1
 
@@ -126,20 +129,15 @@ def _add_squares(to: Tensor, image: Tensor, factor: float = 1.0) -> Tensor:
 
 
 def finite_colors(colors: Tensor, alpha: Tensor, cover: Tensor, threshold: float) -> tuple[Tensor, bool]:
-    """Return colors (C, H, W) with pixels that are not finite set to 0, and whether a non-finite value matters.
+    """Return colors (3, H, W) with pixels that are not finite set to 0, and whether a non-finite value matters.
 
     In alpha (H, W) any does. In the colors it does unless alpha is 0 there and ``cover`` (H, W) at most the threshold,
     because some renderers divide 0 by 0 where nothing covers a pixel; it always does if no pixel is finite. Raises a
     ValueError for an alpha above 1.
     """
     # One transfer for both numbers: each would make the host wait for a GPU.
-    largest = alpha.amax() if alpha.numel() else alpha.sum()
-    total, highest = torch.stack((colors.sum() + alpha.sum(), largest)).tolist()
-    if MAX_ALPHA < highest < math.inf:
-        raise ValueError(
-            f"an alpha must be in [0, 1], got values up to {highest:g}: is it a depth map, or does it count to 255? "
-            "Return the accumulated alpha of every pixel, the sum of its blend weights."
-        )
+    total, highest = torch.stack((colors.sum() + alpha.sum(), _highest(alpha))).tolist()
+    _check_highest(highest)
     if math.isfinite(total):
         return colors, False
     odd = ~colors.isfinite().all(0)
@@ -152,12 +150,44 @@ def effect_of(value: float, differ: list[Tensor]) -> Reason:
     return Reason.NO_EFFECT if value == 0 and bool(torch.stack(differ).any()) else Reason.OK
 
 
+def exact_mean(
+    moments: ExactMoments, alpha: Tensor, threshold: float, broken: bool
+) -> tuple[Tensor, Tensor, float, Reason]:
+    """Return variance (H, W), visible pixels, and the mean over them or why there is none, of exact moments.
+
+    ``alpha`` is the expected one; ``broken`` as for `visible_mean`. A GPU is waited for once, unless something is not
+    finite. Raises what `finite_colors` does.
+    """
+    mean, variance, _ = moments
+    visible, spread = alpha > threshold, variance.mean(0).to(torch.float64)
+    sums = [x.sum(dtype=torch.float64) for x in (mean, variance, alpha)]
+    found = torch.stack([*sums, _highest(alpha).double(), *_visible_sums(spread, visible)])
+    *totals, highest, pixels, total = found.tolist()
+    _check_highest(highest)
+    if all(math.isfinite(x) for x in totals):
+        return spread, visible, *_mean_or_reason(pixels, total, broken, 1.0)
+    for colors in (mean, variance):
+        colors, odd = finite_colors(colors, alpha, alpha, threshold)
+        broken |= odd
+    spread = colors.mean(0).to(torch.float64)
+    return spread, visible, *visible_mean(spread, visible, broken, 1.0)
+
+
 def visible_mean(variance: Tensor, visible: Tensor, broken: bool, excess: float) -> tuple[float, Reason]:
     """Average over the visible pixels, or say why not; ``broken`` is what `finite_colors` found.
 
     ``excess`` is the divisor of a population variance over that of this one.
     """
-    pixels, total = torch.stack((visible.sum(dtype=torch.float64), (variance * visible).sum())).tolist()
+    pixels, total = torch.stack(_visible_sums(variance, visible)).tolist()
+    return _mean_or_reason(pixels, total, broken, excess)
+
+
+def _visible_sums(variance: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the number of visible pixels, and the sum over them."""
+    return visible.sum(dtype=torch.float64), (variance * visible).sum()
+
+
+def _mean_or_reason(pixels: float, total: float, broken: bool, excess: float) -> tuple[float, Reason]:
     if broken:
         return math.nan, Reason.NOT_FINITE
     if pixels == 0:
@@ -167,3 +197,16 @@ def visible_mean(variance: Tensor, visible: Tensor, broken: bool, excess: float)
         return math.nan, Reason.NOT_FINITE
     # Colors in [0, 1] vary by at most 1/4 (Popoviciu's inequality), which is reached if they are 0 or 1 half the time.
     return (mean, Reason.OK) if mean <= 0.25 * excess * (1.0 + 1e-6) else (math.nan, Reason.OUT_OF_RANGE)
+
+
+def _highest(alpha: Tensor) -> Tensor:
+    """Return the largest alpha, 0 of none."""
+    return alpha.amax() if alpha.numel() else alpha.sum()
+
+
+def _check_highest(highest: float) -> None:
+    if MAX_ALPHA < highest < math.inf:
+        raise ValueError(
+            f"an alpha must be in [0, 1], got values up to {highest:g}: is it a depth map, or does it count to 255? "
+            "Return the accumulated alpha of every pixel, the sum of its blend weights."
+        )

@@ -12,7 +12,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from ca_reg._accumulate import Deviations, RenderMoments, effect_of, finite_colors, visible_mean
+from ca_reg._accumulate import Deviations, RenderMoments, effect_of, exact_mean, finite_colors, visible_mean
 from ca_reg._check import check_callable, check_count, check_finite, check_opacity, check_opacity_range, check_rate
 from ca_reg._random import seeded
 from ca_reg.functional import Multiplier
@@ -459,10 +459,8 @@ class ExactScore(CAScore):
             black, broken = finite_colors(over_black.mean, total, total, 0)
             neutral = (black / torch.where(total > 0, total, 1.0)).nan_to_num(0.0, 0.0, 0.0)
             background = neutral if self.layout == "CHW" else neutral.permute(1, 2, 0)
-        (mean, variance, _), alpha = moments(background)
-        colors, odd = finite_colors(torch.cat((mean, variance)), alpha, alpha, settings.threshold)
-        variance, visible = colors[3:].mean(0).to(torch.float64), alpha > settings.threshold
-        value, reason = visible_mean(variance, visible, broken or odd, 1.0)
+        image, alpha = moments(background)
+        variance, visible, value, reason = exact_mean(image, alpha, settings.threshold, broken)
         std_error = 0.0 if reason is Reason.OK else math.nan
         result = self._result(value, std_error, variance, visible, reason, None)
         return ExactView(result, opacity, multiplier, background)
