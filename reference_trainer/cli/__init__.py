@@ -23,9 +23,10 @@ except ImportError as error:
 
 from reference_trainer.cli.listing import registry
 from reference_trainer.cli.models import Bake, Clean, Diff, Evaluate, Render, Report, View
+from reference_trainer.cli.options import refuse_old_options
 from reference_trainer.cli.photos import Run
 from reference_trainer.cli.setup import Names, Poses, Recipes, Version, Warmup
-from reference_trainer.cli.studies import Study
+from reference_trainer.cli.studies import MOVED, Study
 from reference_trainer.cli.training import Compare, Demo, Plan, Train, given_fields
 from reference_trainer.devices import check_device
 from reference_trainer.training.config import TrainConfig
@@ -93,6 +94,10 @@ def _log_shown() -> Iterator[None]:
 
 def _parse(arguments: Sequence[str]) -> Any:
     """Return the command with its options; exits if they cannot be parsed."""
+    if arguments[:1] == ["study"] and (moved := MOVED.get("".join(arguments[1:2]))):
+        raise ValueError(f"study {arguments[1]} is now {moved}, called from a checkout of the repository.")
+    usual = TrainConfig()
+    refuse_old_options(arguments, [usual.renderer, *(f"--{name}" for name in vars(usual))])
     peek = argparse.ArgumentParser(prog="ca-reg", add_help=False, allow_abbrev=False)
     peek.add_argument("--recipe", nargs="?")
     peek.add_argument("--iterations", nargs="?")
@@ -100,7 +105,7 @@ def _parse(arguments: Sequence[str]) -> Any:
     recipe = peeked.recipe
     if recipe and recipe not in RECIPES:
         raise ValueError(f"there is no recipe {recipe!r}; choose one of {', '.join(RECIPES)}.")
-    asked = {} if recipe else {"iterations": TrainConfig().iterations}
+    asked = {} if recipe else {"iterations": usual.iterations}
     with contextlib.suppress(ValueError):  # what is no number tyro refuses
         asked = {"iterations": int(peeked.iterations or "")}
     config = with_recipe(recipe or "3dgs", **asked)

@@ -18,9 +18,16 @@ from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 
 __all__ = [
     "Device", "Orbit", "PlyScene", "RenderOptions", "Rendering", "Trust", "check_model", "check_out", "check_ply",
-    "check_scenes", "place_of",
+    "check_scenes", "place_of", "refuse_old_options",
 ]  # fmt: skip
 
+
+_OLD = {
+    ("--renderer", "torch"): "the renderer of this package is called builtin: --renderer builtin",
+    ("--engine", "loops"): "this engine is called by what compiles it: --engine numba",
+    ("--fields", None): "models that train side by side are called models: --models",
+}
+"""Options, with the value that is refused or None for all, and what they are called now."""
 
 Device = Annotated[str, tyro.conf.arg(help='"cpu" or "cuda".')]
 Orbit = Annotated[OrbitOptions, tyro.conf.arg(name="orbit")]
@@ -136,3 +143,15 @@ def check_scenes(paths: Sequence[str]) -> None:
     for path in paths:
         if path != "synthetic" and not Path(path).exists():
             raise FileNotFoundError(f"there is no scene folder {path}; for the built-in scene, say 'synthetic'.")
+
+
+def refuse_old_options(arguments: Sequence[str], known: Sequence[str]) -> None:
+    """Refuse options and values of earlier versions with a ValueError that has their new names.
+
+    Those that are ``known`` are in use: what is old here may not be everywhere yet.
+    """
+    words = [part for word in arguments for part in (word.split("=", 1) if word.startswith("--") else [word])]
+    for (option, value), now in _OLD.items():
+        for word, after in zip(words, [*words, ""][1:], strict=True):
+            if word.replace("_", "-") == option and value in (None, after) and (value or option) not in known:
+                raise ValueError(f"{option}{f' {value}' if value else ''} is a name of earlier versions: {now}.")
