@@ -36,6 +36,13 @@ class SharesFn(Protocol):
     It takes the arguments of :class:`~ca_reg.types.MomentsFn` and weights of the pixels, (H, W) in float64. It returns,
     (N,), the :func:`~ca_reg.functional.contributions` of every Gaussian, averaged over RGB and summed over the pixels
     with these weights, as :meth:`ca_reg.lists.ListMoments.shares` does; 0 if the view does not see it.
+
+    Example:
+        >>> from ca_reg.functional import contributions
+        >>> def shares_fn(
+        ...     opacity: Tensor, view: Tensor, multiplier: Multiplier, background: Tensor | None, weights: Tensor
+        ... ) -> Tensor:  # every pixel shows the same Gaussians, in the order of their index
+        ...     return contributions(opacity, view, multiplier, background=background).mean(-1) * weights.sum()
     """
 
     def __call__(
@@ -76,7 +83,8 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor | Params, vie
         view: passed on to both callables.
 
     Raises:
-        ValueError: if the score is not exact, or ``shares_fn`` returns another shape; others are those of the score.
+        TypeError: as for a call of the score.
+        ValueError: as for a call of the score, if the score is not exact, or ``shares_fn`` returns another shape.
 
     Example:
         A red Gaussian in front of a blue one, over black:
@@ -129,6 +137,9 @@ def hanging(
     Returns:
         Which Gaussians hang, bool, shape (N,).
 
+    Raises:
+        ValueError: if the shapes differ, or a number is out of range.
+
     Example:
         The second Gaussian is seen beside the training cameras only; the third too, but hardly matters.
 
@@ -153,10 +164,21 @@ def total_effects(score: CAScore, opacity: Tensor | Params, view: Any) -> CATota
     """Measure a view exactly and find how much the score would fall if one Gaussian's factor were fixed at its mean.
 
     Costs the score, and a forward and backward pass of its moments callable, which must be differentiable in the
-    variance of the multiplier, a tensor (N,). Arguments and errors are those of :func:`attribute`.
+    variance of the multiplier, a tensor (N,). The arguments are those of :func:`attribute`.
 
-    In the example of :func:`attribute` the effects are 0.0275 and 0.0333: the interaction now counts for the Gaussian
-    in front as well.
+    Raises:
+        TypeError: as for a call of the score.
+        ValueError: as for a call of the score, if the score is not exact, or its moments are not differentiable.
+
+    Example:
+        The scene of :func:`attribute`; the interaction now counts for the Gaussian in front as well.
+
+        >>> from ca_reg.lists import ListMoments, PixelLists
+        >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:
+        ...     both = torch.tensor([0, 1])
+        ...     return PixelLists(both, torch.zeros(2, dtype=torch.int64), opacity, torch.eye(3)[[0, 2]], 1, 1)
+        >>> total_effects(CAScore.exact(ListMoments(lists_fn), threshold=0.5), torch.tensor([0.5, 0.8]), None).effects
+        tensor([0.0275, 0.0333], dtype=torch.float64)
     """
     exact, (result, opacity, multiplier, background) = _measure(score, opacity, view, "total_effects")
     if result.reason is not Reason.OK:

@@ -98,6 +98,10 @@ def expected_error(features: Mapping[str, Tensor], mask: Tensor | None = None, *
         mask: which pixels count for the PSNR, (H, W) bool; None for all.
         unit: factor on the map: how much harder than the scenes of the fit this one is.
 
+    Raises:
+        TypeError: if a feature is no tensor.
+        ValueError: if no form has its features, or the shapes differ.
+
     Example:
         >>> flat, step = torch.zeros(8, 8), torch.zeros(8, 8)
         >>> step[:, 4:] = 1.0
@@ -148,6 +152,10 @@ def error_map(
         p: dropout rate that the model was trained with; the image is rendered with opacities of ``1 - p``.
         layout: order of the axes of the images.
         known: further features, see :func:`expected_error`, such as ``warp`` and ``hidden``.
+
+    Raises:
+        TypeError: if an argument is of the wrong type.
+        ValueError: if one is out of range, or ``render_fn`` returns no alpha.
 
     Example:
         A wall with a hole: what is not covered is expected to be wrong.

@@ -82,8 +82,6 @@ class ListMoments:
         tensor([[0.1195, 0.0576]], dtype=torch.float64)
         >>> attribute(score, moments.shares, opacity, None).shares
         tensor([0.0704, 0.0181], dtype=torch.float64)
-        >>> moments.weights(opacity, None)  # at the first pixel a fifth of the light passes the second Gaussian
-        tensor([0.6400, 0.8000], dtype=torch.float64)
     """
 
     def __init__(self, lists_fn: Callable[[Tensor, Any], PixelLists]) -> None:
@@ -111,6 +109,14 @@ class ListMoments:
         """Return what each Gaussian contributes to a weighted sum of the variance map, shape (N,), float64.
 
         It is as described at :class:`~ca_reg.attribution.SharesFn`; the shares add up to the weighted sum.
+
+        Example:
+            >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:
+            ...     one = torch.tensor([0])
+            ...     return PixelLists(one, one, opacity[one], torch.ones(2, 3), height=1, width=1)
+            >>> ones = torch.ones(1, 1)
+            >>> ListMoments(lists_fn).shares(torch.tensor([0.5, 0.5]), None, Multiplier.dropout(0.5), None, ones)
+            tensor([0.0625, 0.0000], dtype=torch.float64)
         """
         lists, behind = self._lists(opacity, view, background)
         if weights.shape != (lists.height, lists.width):
@@ -137,6 +143,13 @@ class ListMoments:
         """Return every Gaussian's blend weight: alpha times transmittance, summed over the pixels, (N,), float64.
 
         With shares at cameras that nobody took, these tell what hangs there: :func:`ca_reg.attribution.hanging`.
+
+        Example:
+            >>> def lists_fn(opacity: Tensor, view: None) -> PixelLists:
+            ...     both, one = torch.tensor([0, 1]), torch.zeros(2, dtype=torch.int64)
+            ...     return PixelLists(both, one, opacity, torch.ones(2, 3), height=1, width=1)
+            >>> ListMoments(lists_fn).weights(torch.tensor([0.75, 0.5]), None)  # a quarter of the light passes on
+            tensor([0.7500, 0.1250], dtype=torch.float64)
         """
         walk = _Walk.over(*self._lists(opacity, view, None), Multiplier(1.0, 0.0))
         out = torch.zeros(len(walk.values), dtype=torch.float64, device=walk.values.device)

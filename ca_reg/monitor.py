@@ -69,7 +69,8 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         writer: of TensorBoard and all sinks, for curves of one's own; None where there is neither.
 
     Raises:
-        ValueError: if a group is empty, a number is out of range, or a line of the log is damaged.
+        TypeError: if ``views`` is not a mapping or an argument is of the wrong type.
+        ValueError: if there are no views, a group is empty, a number is out of range, or a line of the log is damaged.
         OSError: if the log cannot be written, such as on a full disk; its earlier lines stay intact. A BlockingIOError
             if another monitor has the directory open.
 
@@ -352,7 +353,10 @@ def plot_dynamics(
     matplotlib's, else that of its label in ``colors``; its last group of views (test) is solid. Draws on two ``axes``,
     by default in a new figure, and returns them: co-adaptation, PSNR.
 
-    Raises an ImportError without matplotlib, which comes with ``ca_reg[plot]``, and what :func:`read_dynamics` does.
+    Raises:
+        ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
+        FileNotFoundError: if a log is missing.
+        ValueError: if there is no run, or a log is empty.
     """
     labelled = runs if isinstance(runs, Mapping) else {"": runs}
     if not labelled:

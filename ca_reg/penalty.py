@@ -45,11 +45,14 @@ class CAPenalty(Scheduled):
     weight is a free choice.
 
     ``image`` is also the test-time render, with all opacities multiplied by the mean of the multiplier, up to the
-    renderer's treatment of large and small alphas, which :meth:`~ca_reg.functional.Multiplier.clamped_noise` bounds.
-    ``train()`` and ``eval()`` make no difference. No Gaussian is dropped, so density control needs no masked radii.
+    renderer's treatment of large and small alphas: its clamp at 0.99, before the factor here and after it there, moves
+    a color by at most ``R / 99``, R being the range of the colors and the background; its cut-off at 1/255 by at most
+    ``R / 255`` for each splat. ``train()`` and ``eval()`` make no difference. No Gaussian is dropped, so density
+    control needs no masked radii.
 
-    Limits: the factors must be independent, one per Gaussian. Plain dropout is exact but for the early termination of a
-    sampled render. So is compensated dropout if the call gets the opacities of survivors, ``opacity / (1 - p)``, and
+    Limits: the factors must be independent, one per Gaussian. The clamp and the cut-off of alphas that a factor changed
+    are not modeled, see :class:`~ca_reg.functional.Multiplier`; plain dropout is exact but for the early termination of
+    a sampled render. So is compensated dropout if the call gets the opacities of survivors, ``opacity / (1 - p)``, and
     ``multiplier`` is ``Multiplier.dropout(p)``; ``image`` is then not the test-time render where opacities exceed
     ``0.99 (1 - p)``.
 
@@ -63,6 +66,10 @@ class CAPenalty(Scheduled):
             the opacities, (N,), at every call, such as ``lambda o: Multiplier.clamped_noise(o, 0.8)``, with gradients.
         weight: factor of the penalty, at least 0, or a schedule of it.
         layout: order of the axes of the images that ``moments_fn`` returns, ``"CHW"`` or ``"HWC"``.
+
+    Raises:
+        TypeError: if an argument is of the wrong type.
+        ValueError: if ``weight`` is negative or not finite, or ``layout`` is unknown.
 
     Example:
         One white splat over black that half of the draws leave out: a pixel is 0 or 0.8.

@@ -39,6 +39,7 @@ class Params(NamedTuple):
         step: the training step, from 0 on, which schedules follow; None for that of the module or score that is called.
 
     Example:
+        >>> import torch
         >>> x = Params(torch.full((4,), 0.5), means=torch.zeros(4, 3))
         >>> x._replace(opacities=x.opacities * 0.8).opacities
         tensor([0.4000, 0.4000, 0.4000, 0.4000])
@@ -58,6 +59,9 @@ class Params(NamedTuple):
         """Depths of the centers along the camera's z axis, (N,), at least float32, negative behind the camera.
 
         A regularizer that reads them lists ``means`` and ``view_matrix`` in its ``needs``. Without gradients.
+
+        Raises:
+            ValueError: if there are no means or no view matrix.
         """
         if self.means is None or self.view_matrix is None:
             raise ValueError("depths need means and view_matrix; list both in the needs of the regularizer.")
@@ -202,14 +206,18 @@ class Regularizer(Scheduled):
         return self.alpha_factor(x)
 
     def regularize(self, x: Params, generator: torch.Generator | None = None) -> Params:
-        """Draw, store the draw in :attr:`last`, and apply it; trainers and hooks call this."""
+        """Draw, store the draw in :attr:`last`, and apply it; trainers and hooks call this.
+
+        Raises:
+            ValueError: if ``x`` lacks a field that the regularizer needs.
+        """
         self.check_needs(x)
         draw = self.draw(x, generator)
         self._remember(draw)
         return self.replay(x, draw)
 
     def forward(self, x: Given, *, drawn: Draw | None = None, generator: torch.Generator | None = None) -> Given:
-        """Return what to render, of the type of ``x``; the very same object if nothing changes.
+        """Return what to render.
 
         Args:
             x: activated opacities in [0, 1], shape (N,) or (N, 1), or all parameters with such opacities. Without a
@@ -218,8 +226,13 @@ class Regularizer(Scheduled):
             generator: source of this draw; the global random state is then untouched. It belongs to the call, so that
                 the random numbers of a step can depend on the step alone.
 
-        Raises a TypeError or a ValueError for opacities of the wrong type or shape or that look like logits, for a
-        needed field that is missing, and for ``drawn`` in evaluation.
+        Returns:
+            The same type as ``x``; the very same object if nothing changes.
+
+        Raises:
+            TypeError: if the opacities are not a floating-point tensor.
+            ValueError: if a shape is wrong, the opacities look like logits, a needed field is missing, or ``drawn`` is
+                given in evaluation.
         """
         given = x if isinstance(x, Params) else Params(x)
         self._check(given.opacities)
@@ -261,8 +274,20 @@ class Regularizer(Scheduled):
     def mask_radii(self, radii: Tensor) -> Tensor:
         """Zero the radii of the Gaussians that the last call dropped, so that density control does not count them.
 
-        Counted as seen, they would raise the effective densification threshold by ``1 / (1 - p)``. Takes the radii of
-        all Gaussians, shape (N,) or (N, ...); returns the very same tensor if nothing was dropped.
+        Counted as seen, they would raise the effective densification threshold by ``1 / (1 - p)``.
+
+        Takes the radii of all Gaussians, shape (N,) or (N, ...); returns the very same tensor if nothing was dropped.
+
+        Raises:
+            ValueError: if the number of Gaussians is not that of the last call.
+
+        Example:
+            >>> from ca_reg import GaussianDropout
+            >>> dropout = GaussianDropout(p=0.5)
+            >>> _ = dropout(torch.full((4,), 0.5))
+            >>> radii = torch.tensor([3, 1, 2, 5])
+            >>> torch.equal(dropout.mask_radii(radii) > 0, dropout.keep)
+            True
         """
         keep = self.keep
         if keep is None:

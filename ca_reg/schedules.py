@@ -27,7 +27,12 @@ Schedule = Callable[[int], float]
 
 @dataclass(frozen=True)
 class Constant:
-    """The same rate at every step, as in the paper."""
+    """The same rate at every step, as in the paper.
+
+    Example:
+        >>> Constant(0.2)(1000)
+        0.2
+    """
 
     value: float
 
@@ -152,7 +157,12 @@ SCHEDULES = {"ramp": LinearRamp, "between": StartStop, "decay": ExponentialDecay
 
 
 def as_schedule(rate: float | Schedule) -> Schedule:
-    """Return ``rate`` if it is callable, else the constant schedule of that rate."""
+    """Return ``rate`` if it is callable, else the constant schedule of that rate.
+
+    Example:
+        >>> as_schedule(0.2)
+        Constant(value=0.2)
+    """
     return rate if callable(rate) else Constant(rate)
 
 

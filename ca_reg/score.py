@@ -83,6 +83,10 @@ class CAScore:
         seed: seed of the masks. They are drawn on the CPU from (seed, view index) alone: the same on every device, and
             whatever other views there are. More renders extend the same sequence.
 
+    Raises:
+        TypeError: if an argument is of the wrong type.
+        ValueError: if one is out of range.
+
     Example:
         A wall of ten gray layers; where one is missing, the next shows.
 
@@ -95,9 +99,6 @@ class CAScore:
         >>> result = score(torch.full((10,), 0.9), view=None)
         >>> result.reason, 0.005 < result.value < 0.05, result.variance.shape
         (<Reason.OK: ...>, True, torch.Size([4, 4]))
-        >>> adaptive = CAScore.adaptive(render_fn, relative_error=0.2, threshold=0.5)
-        >>> adaptive(torch.full((10,), 0.9), view=None).samples in range(16, 257, 8)
-        True
     """
 
     def __init__(
@@ -180,6 +181,14 @@ class CAScore:
 
         ``relative_error``, above 0, is the target of the standard error as a fraction of the score. ``max_samples``, at
         least 16, ends the sampling in any case. The other arguments are those of :class:`CAScore`.
+
+        Example:
+            >>> score = CAScore.adaptive(
+            ...     lambda opacity, view: (opacity[:48].view(3, 4, 4), torch.ones(4, 4)), relative_error=0.2
+            ... )
+            >>> result = score(torch.ones(50), view=None)
+            >>> result.std_error / result.value <= 0.2, result.samples in range(16, 257, 8)
+            (True, True)
         """
         limits = relative_error, max_samples
         return _AdaptiveScore(render_fn, alpha_fn, seed, limits, threshold, layout, p, drop_rate, regularizer)

@@ -66,7 +66,16 @@ class MomentsFn(Protocol):
     ``background`` is None for the model's own, one color (3,), or an image. The renderer must not stop early at an
     opaque surface: splats behind it show where those of the surface are dropped.
 
-    :meth:`ca_reg.CAScore.exact` has an example.
+    Example:
+        >>> from ca_reg.functional import alpha_moments, pixel_moments
+        >>> def moments_fn(
+        ...     opacity: Tensor, view: Tensor, multiplier: Multiplier, background: Tensor | None
+        ... ) -> dict[str, Tensor]:
+        ...     mean, variance = pixel_moments(opacity, view, multiplier, background=background)
+        ...     images = {"mean": mean, "variance": variance}
+        ...     return {name: x[:, None, None].expand(3, 4, 5) for name, x in images.items()} | {
+        ...         "alpha_mean": alpha_moments(opacity, multiplier).mean.expand(4, 5)
+        ...     }
     """
 
     def __call__(self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None, /) -> Any:
@@ -110,7 +119,7 @@ def read_rendering(result: Any, *, layout: Layout = "CHW") -> Rendering:
     if image is None:
         raise TypeError(f"a render callable returned {_describe(result)} without an image; {_FORMS}.")
     read = _read_image(_as_tensor(image, "image"), layout)
-    return Rendering(read, _read_alpha(alpha, read))
+    return Rendering(read, None if alpha is None else _read_alpha(alpha, read))
 
 
 def read_alpha_pass(result: Any, image: Tensor, *, layout: Layout = "CHW") -> Tensor:
@@ -119,6 +128,11 @@ def read_alpha_pass(result: Any, image: Tensor, *, layout: Layout = "CHW") -> Te
     The result may also be the alpha itself, (H, W), (1, H, W) or (H, W, 1).
 
     Raises TypeError or ValueError if it is neither, or its size is not that of ``image``, (3, H, W).
+
+    Example:
+        >>> white = torch.full((3, 4, 5), 0.9)
+        >>> read_alpha_pass(white, torch.zeros(3, 4, 5)).shape
+        torch.Size([4, 5])
     """
     if isinstance(result, Tensor | np.ndarray):
         plane = _as_plane(_as_tensor(result, "alpha"), image)
@@ -139,6 +153,12 @@ def read_moments(result: Any, *, layout: Layout = "CHW") -> ExactMoments:
     Raises:
         TypeError: if a member is missing or not floating point.
         ValueError: if a shape does not fit, or ``layout`` is unknown.
+
+    Example:
+        >>> image = torch.rand(4, 5, 3)
+        >>> result = {"mean": image, "variance": image / 9, "alpha_mean": torch.ones(4, 5)}
+        >>> read_moments(result, layout="HWC").variance.shape
+        torch.Size([3, 4, 5])
     """
     check_layout(layout)
     images = {name: _by_name(result, (name,)) for name in ("mean", "variance")}
@@ -154,7 +174,8 @@ def read_moments(result: Any, *, layout: Layout = "CHW") -> ExactMoments:
             f"mean and variance of a moments callable must have one shape, got {tuple(mean.shape)} and "
             f"{tuple(variance.shape)} (as CHW)."
         )
-    return ExactMoments(mean, variance, _read_alpha(_by_name(result, ("alpha_mean",)), mean))
+    alpha = _by_name(result, ("alpha_mean",))
+    return ExactMoments(mean, variance, None if alpha is None else _read_alpha(alpha, mean))
 
 
 def check_layout(layout: str) -> None:
@@ -225,10 +246,8 @@ def _read_image(x: Tensor, layout: Layout) -> Tensor:
     return x if layout == "CHW" else x.permute(2, 0, 1)
 
 
-def _read_alpha(x: Any, image: Tensor) -> Tensor | None:
-    """Return a named alpha as (H, W), None if there is none, or raise."""
-    if x is None:
-        return None
+def _read_alpha(x: Any, image: Tensor) -> Tensor:
+    """Return a named alpha as (H, W), or raise."""
     alpha = _as_tensor(x, "alpha")
     plane = _as_plane(alpha, image)
     if plane is None:

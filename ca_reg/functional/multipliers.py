@@ -104,8 +104,14 @@ class Multiplier:
         length of the list; its cut-off at 1/255 moves a sampled color by at most ``R / 255`` for each splat that
         crosses it.
 
-        Mean and variance have shape and dtype of ``opacity``, which is at least 0 and of any shape; at ``o = 0`` they
-        are the limits of small opacities. With ``clip`` the draw is clipped to [-sigma, sigma] before it is applied.
+        Args:
+            opacity: activated opacities ``o``, at least 0, any shape.
+            sigma: standard deviation of the relative noise, at least 0.
+            clip: the draw is clipped to [-sigma, sigma] before it is applied.
+
+        Returns:
+            Mean and variance per Gaussian of ``clamp(o (1 + eps), 0, 1) / min(o, 1)``, shape and dtype of ``opacity``.
+            At ``o = 0`` it is the limit of small opacities.
 
         Example:
             >>> noise = Multiplier.clamped_noise(torch.tensor([0.01, 1.0]), 0.2)

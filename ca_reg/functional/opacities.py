@@ -31,16 +31,18 @@ def draw_keep_mask(
 ) -> Tensor:
     """Draw which Gaussians stay: each one independently with probability ``1 - p``.
 
-    Returns True where the Gaussian stays, (n,) bool, on ``device``, by default where it was drawn. The uniform numbers
-    behind the mask are float32 whatever the opacities are, so float32 and float64 runs with equal seeds drop the same
-    Gaussians.
+    The uniform numbers behind the mask are float32 whatever the opacities are, so float32 and float64 runs with equal
+    seeds drop the same Gaussians.
 
     Args:
         n: number of Gaussians.
         p: drop rate in [0, 1); a number, or one for each Gaussian, shape (n,).
         generator: source of the draw, on whose device the numbers are drawn: a CPU generator gives the same mask on
             every device. The global random state is then untouched.
-        device: of the mask.
+        device: device of the returned mask; by default where it was drawn.
+
+    Returns:
+        True where the Gaussian stays, shape (n,), bool.
 
     Raises:
         RuntimeError: if a draw with a generator is repeated by ``torch.utils.checkpoint``; draw outside it.
@@ -72,6 +74,9 @@ def apply_dropout(opacity: Tensor, keep: Tensor, *, p: Rate = 0.0, compensate: b
         compensate: multiply the survivors by ``1 / (1 - p)``, so that the mean over masks is ``opacity`` and nothing
             needs to be scaled at test time. They may then exceed 1; rasterizers clamp them, at 0.99 or 0.999, which
             lowers the mean alpha.
+
+    Returns:
+        The masked opacities, a new tensor of the same shape and dtype.
 
     Example:
         >>> opacity, keep = torch.tensor([0.5, 0.8]), torch.tensor([True, False])
@@ -119,11 +124,18 @@ def draw_opacity_noise(
     generator: torch.Generator | None = None,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Draw one normal number of standard deviation ``sigma``, 0 to 1e30, per Gaussian: relative noise, (n,) float32.
+    """Draw one normal number of standard deviation ``sigma`` per Gaussian.
 
-    With ``clip`` the draw is clipped to [-sigma, sigma], as the authors' released code does but the paper does not
-    mention; the variance is then 0.516 sigma^2. Generator and device are those of
-    :func:`~ca_reg.functional.draw_keep_mask`.
+    Args:
+        n: number of Gaussians.
+        sigma: standard deviation, from 0 to 1e30.
+        clip: clip the draw to [-sigma, sigma], as the authors' released code does but the paper does not mention. The
+            variance is then 0.516 sigma^2.
+        generator: source of the draw, with the limits of :func:`~ca_reg.functional.draw_keep_mask`.
+        device: device of the returned noise; by default where it was drawn.
+
+    Returns:
+        The relative noise, shape (n,), float32 whatever the opacities are.
 
     Example:
         >>> noise = draw_opacity_noise(1000, 0.8, clip=True)
@@ -189,7 +201,12 @@ def scale_opacity(opacity: Tensor, p: Rate) -> Tensor:
         opacity: activated opacities in [0, 1], shape (N,) or (N, 1); returned as they are with ``p = 0``.
         p: the drop rate in training, in [0, 1); a number, or one for each Gaussian, shape (N,).
 
+    Raises:
+        TypeError: if ``opacity`` is not a floating-point tensor.
+        ValueError: if its shape is neither (N,) nor (N, 1), or ``p`` is outside [0, 1) or not one number per Gaussian.
+
     Example:
+        >>> import torch
         >>> scale_opacity(torch.tensor([0.5, 1.0]), 0.2)
         tensor([0.4000, 0.8000])
     """
@@ -213,7 +230,13 @@ def expected_opacity(opacity: Tensor, sigma: float, *, clip: bool = False) -> Te
         sigma: standard deviation of the relative noise in training, at least 0.
         clip: whether the draws were clipped to [-sigma, sigma].
 
+    Raises:
+        TypeError: if ``opacity`` is not a floating-point tensor or ``sigma`` not a number.
+        ValueError: if a shape is neither (N,) nor (N, 1), an opacity is outside [0, 1], or ``sigma`` is negative, not
+            finite, or its square overflows.
+
     Example:
+        >>> import torch
         >>> expected_opacity(torch.tensor([0.1, 0.5, 1.0]), 0.8)
         tensor([0.1040, 0.5000, 0.7213])
     """

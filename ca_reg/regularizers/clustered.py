@@ -97,10 +97,13 @@ class AnchorDropout(ClusteredDropout):
         every: steps between neighbor searches; the paper does not say.
 
     Example:
-        >>> x = Params(torch.ones(500), means=torch.rand(500, 3))
-        >>> AnchorDropout().draw(x._replace(step=0)).keep is None
+        >>> import torch
+        >>> from ca_reg import Params
+        >>> anchors = AnchorDropout()
+        >>> anchors.draw(Params(torch.ones(500), means=torch.rand(500, 3), step=0)).keep is None
         True
-        >>> bool(AnchorDropout().draw(x._replace(step=10_000)).keep.all())
+        >>> keep = anchors.draw(Params(torch.ones(500), means=torch.rand(500, 3), step=10_000)).keep
+        >>> bool(keep.all())
         False
     """
 

@@ -35,6 +35,8 @@ class D2GSDropout(SurroundingsDropout):
     - densities are computed only at step 1 and every ``every`` steps: if Gaussians have been added since, all count as
       0.5; if some were removed, the first N values are taken, whichever Gaussians they belonged to.
 
+    Convention: the view matrix is world to camera; depth is along its third axis.
+
     Args:
         rate: the largest rate, or a schedule of it. The source's rises from 0.05 to 0.3 over 10,000 steps.
         depth_weight: of nearness, at least 0. In the source 0.3, and 0.15 to 0.7 in its script for single scenes.
@@ -45,6 +47,7 @@ class D2GSDropout(SurroundingsDropout):
         scale: scale the opacities in evaluation, which the source does not.
 
     Example:
+        >>> from ca_reg import Params
         >>> means = torch.tensor([[0.0, 0, 1], [0.0, 0, 2], [0.0, 0, 4]])
         >>> x = Params(torch.ones(3), means=means, view_matrix=torch.eye(4), step=10_000)
         >>> D2GSDropout(k=1).rates(x)
@@ -126,6 +129,8 @@ class DepthDropout(IndependentDropout):
     constants. Here it is linear in the rank between D2GS's outer tiers; the opposite direction is ``depth(near=0.3,
     far=1.0)``.
 
+    Convention: the view matrix is world to camera; depth is along its third axis.
+
     Args:
         rate: the largest rate, or a schedule of it.
         near: factor of the rate for the nearest Gaussian, at least 0.
@@ -133,6 +138,7 @@ class DepthDropout(IndependentDropout):
         scale: scale the opacities in evaluation.
 
     Example:
+        >>> import torch
         >>> means = torch.tensor([[0.0, 0, 1], [0.0, 0, 2], [0.0, 0, 40]])
         >>> x = Params(torch.ones(3), means=means, view_matrix=torch.eye(4), step=10_000)
         >>> DepthDropout().rates(x)

@@ -113,6 +113,10 @@ class GaussianDropout(IndependentDropout):
         p: drop rate in [0, 1), or a schedule of it. The paper uses 0.2.
         compensate: scale the survivors in training rather than all opacities in evaluation.
 
+    Raises:
+        TypeError: if ``p`` is neither a number nor callable.
+        ValueError: if a constant ``p`` is outside [0, 1); a schedule is checked at each use.
+
     Example:
         >>> dropout = GaussianDropout(p=0.2)
         >>> opacity = torch.full((5,), 0.5)
@@ -120,9 +124,6 @@ class GaussianDropout(IndependentDropout):
         >>> torch.equal(in_training, opacity * dropout.keep)
         True
         >>> torch.equal(dropout(opacity, drawn=dropout.last), in_training)  # replay
-        True
-        >>> radii = torch.tensor([3, 1, 2, 5, 4])  # of the rasterizer
-        >>> torch.equal(dropout.mask_radii(radii) > 0, dropout.keep)
         True
         >>> dropout.eval()(opacity)
         tensor([0.4000, 0.4000, 0.4000, 0.4000, 0.4000])
@@ -154,6 +155,7 @@ class DropGaussian(GaussianDropout):
         steps: length of the ramp; the source trains for 10,000 steps, shorter trainings should pass their own length.
 
     Example:
+        >>> import torch
         >>> dropout = DropGaussian()
         >>> dropout.set_step(5_000)
         >>> opacity = torch.full((4,), 0.5)

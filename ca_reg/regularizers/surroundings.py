@@ -174,16 +174,19 @@ class DensityDropout(RankedDropout):
 
     ``p = low + (high - low) rank``, with the rank in [0, 1] of the density, which falls with the mean distance to the k
     nearest neighbors. ``train()``: ``opacity * keep``; ``eval()``: ``opacity * (1 - p)``. The paper gives the rates and
-    their linear mapping, but neither ``k`` nor the measure of density; with ranks, no outlier dominates the rates. The
-    other arguments are those of :class:`~ca_reg.IndependentDropout`.
+    their linear mapping, but neither ``k`` nor the measure of density; with ranks, no outlier dominates the rates.
 
     Args:
         low: rate of the sparsest, in [0, 1). The paper uses 0.2.
         high: rate of the densest, in [0, 1). The paper uses 0.5.
         k: number of neighbors; 3DGS initializes its scales from 3.
         every: steps between neighbor searches; by default 3DGS's densification interval.
+        compensate: as in :class:`~ca_reg.IndependentDropout`.
+        scale: likewise.
 
     Example:
+        >>> import torch
+        >>> from ca_reg import Params
         >>> means = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0], [9.0, 0, 0], [99.0, 0, 0]])
         >>> DensityDropout(k=1).rates(Params(torch.ones(5), means=means))
         tensor([0.4250, 0.4250, 0.4250, 0.2750, 0.2000])
@@ -205,14 +208,18 @@ class GeometryDropout(RankedDropout):
 
     The paper has one sentence about it, "estimate local geometric complexity by computing structural variation among
     each Gaussian's nearest neighbors", without the measure, its direction, the rates or ``k``: here the measure is the
-    standard one for point clouds, and rates and other arguments are those of :class:`DensityDropout`.
+    standard one for point clouds, and the rates are those of the paper's density-based dropout.
 
     Args:
         low: rate where the surroundings vary least, in [0, 1).
         high: rate where they vary most, in [0, 1).
         k: number of neighbors.
+        every: as in :class:`DensityDropout`.
+        compensate: likewise.
+        scale: likewise.
 
     Example:
+        >>> from ca_reg import Params
         >>> plane = torch.rand(100, 3) * torch.tensor([1.0, 1.0, 0.0])
         >>> cloud = torch.rand(100, 3) + 9.0
         >>> rates = GeometryDropout().rates(Params(torch.ones(200), means=torch.cat([plane, cloud])))
