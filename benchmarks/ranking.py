@@ -180,7 +180,7 @@ def _measure(checkpoint: Path, split: str, views: int | None, device: str) -> Re
     return {
         "scene": _scene(trainer.scene.name, options),
         "split": split,
-        "strategy": trainer.config.regularizers or "baseline",
+        "strategy": run.parent.name if run.name.startswith("seed_") else trainer.config.regularizers or "baseline",
         "training_views": len(trainer.scene.train),
         "seed": trainer.config.seed,
         "settings": {name: value for name, value in settings.items() if name not in _IN_LABEL},
@@ -213,7 +213,9 @@ def _scenes(records: Records) -> dict[str, list[Record]]:
 
 
 def group_labels(runs: Sequence[Record]) -> list[str]:
-    """Name what each run of a scene shares with its other seeds: strategy, views, and settings in which runs differ.
+    """Name what each run of a scene shares with its other seeds: strategy, views, and what its namesakes differ in.
+
+    The strategy is the folder of the seeds, as `compare` has it, else the regularizers; views are said if they differ.
 
     Args:
         runs: of one scene.
@@ -222,19 +224,21 @@ def group_labels(runs: Sequence[Record]) -> list[str]:
         One label per run; equal for runs that differ in their seed only.
 
     Example:
-        >>> run = {"strategy": "noise 0.8", "training_views": 3}
+        >>> run = {"strategy": "noise", "training_views": 3}
         >>> runs = [run | {"settings": {"iterations": n}} for n in (1000, 2000)]
         >>> group_labels(runs)[1], group_labels(runs[:1])
-        ('noise 0.8, 3 views, iterations 2000', ['noise 0.8, 3 views'])
+        ('noise, iterations 2000', ['noise'])
     """
     names = dict.fromkeys(name for run in runs for name in run["settings"])
-    differ = [name for name in names if len({json.dumps(run["settings"].get(name)) for run in runs}) > 1]
+    several = len({run["training_views"] for run in runs}) > 1
     labels = []
     for run in runs:
+        alike = [other["settings"] for other in runs if other["strategy"] == run["strategy"]]
+        differ = [name for name in names if len({json.dumps(other.get(name)) for other in alike}) > 1]
         # What is off or left to the program needs no word; the others of the scene have one.
         said = {name: value for name in differ if (value := run["settings"].get(name)) not in (False, None, "auto")}
         words = [name if value is True else f"{name} {value}" for name, value in said.items()]
-        labels.append(", ".join([run["strategy"], f"{run['training_views']} views", *words]))
+        labels.append(", ".join([run["strategy"], *[f"{run['training_views']} views"] * several, *words]))
     return labels
 
 
@@ -340,17 +344,20 @@ def _draw(records: Records, figure: Any) -> None:
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
     scenes = _scenes(records)
+    named = {scene: group_labels(runs) for scene, runs in scenes.items()}
+    order = {label: i for i, label in enumerate(sorted({label for labels in named.values() for label in labels}))}
     figure.set_size_inches(WIDTH, 4.6 * len(scenes))
     grid = figure.subplots(len(scenes), 2, squeeze=False)
     for row, (scene, runs) in zip(grid, scenes.items(), strict=True):
-        labels = group_labels(runs)
-        order = {label: i for i, label in enumerate(sorted(set(labels)))}
+        labels = named[scene]
         for ax, (quantity, (name, share)) in zip(row, _DRAWN.items(), strict=True):
-            for label, i in order.items():
-                group = [run for run, named in zip(runs, labels, strict=True) if named == label]
+            for label in sorted(set(labels)):
+                group = [run for run, of in zip(runs, labels, strict=True) if of == label]
                 x, y = ([mean_of(run, score) * 1e3 for run in group] for score in ("exact_half", quantity))
-                ax.scatter(x, y, color=color(label, i), marker="osD^vP*X<>p"[i % 11], label=readable(label))
-            ax.set(xscale="log", yscale="log", title=scene, xlabel="exact CA (10⁻³)", ylabel=f"{name} (10⁻³)")
+                look = {"color": color(label, order[label]), "marker": "osD^vP*X<>p"[order[label] % 11]}
+                ax.scatter(x, y, label=readable(label), **look)
+            title = " (".join([readable(scene.partition(" (")[0]), *scene.split(" (")[1:]])
+            ax.set(xscale="log", yscale="log", title=title, xlabel="exact CA (10⁻³)", ylabel=f"{name} (10⁻³)")
             ax.axline(
                 (1, share),
                 (2, 2 * share),
