@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import islice
-from traceback import walk_stack
 from types import CodeType, FrameType, ModuleType
 from typing import Any, ClassVar, NamedTuple
 
@@ -101,11 +100,14 @@ class Call:
                 f"a regularizer changed {field}, which belongs to the call and is no field of the Gaussians."
             )
         name = self.names.get(field, field)
-        self.arguments[name] = value.reshape(self.arguments[name].shape)
+        shape = self.arguments[name].shape
+        self.arguments[name] = value if value.shape == shape else value.reshape(shape)
 
     def params(self, chain: Chain, step: int) -> Params:
         """Return the opacities (N,) and the other needed fields, batches flattened; ValueError if one is missing."""
-        opacities = self.arguments["opacities"].reshape(-1)
+        opacities: Tensor = self.arguments["opacities"]
+        if opacities.ndim != 1:
+            opacities = opacities.reshape(-1)
         found: dict[str, Any] = {}
         for name in chain.needs:
             if name in ("opacities", "step"):
@@ -245,7 +247,7 @@ def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
         raise TypeError(f"the rasterizer returned {type(returned).__name__}, expected a tuple with colors and radii.")
     count = len(keep)
     shapes = ((count,), (count, 1), (count, 2))
-    counts = [isinstance(x, Tensor) and not x.dtype.is_floating_point and x.shape in shapes for x in returned]
+    counts = [isinstance(x, Tensor) and not x.is_floating_point() and x.shape in shapes for x in returned]
     if not any(counts):
         found = ", ".join(f"{x.dtype} {tuple(x.shape)}" if isinstance(x, Tensor) else str(type(x)) for x in returned)
         raise ValueError(
@@ -318,9 +320,12 @@ class CallSite(NamedTuple):
             frame = frame.f_back
         if found is None:
             return cls({}, ())
-        place = tuple((frame.f_code, frame.f_lasti) for frame, _ in walk_stack(found))
+        place, frame = [], found
+        while frame is not None:  # traceback.walk_stack finds out the lines as well, which takes longer than the rest
+            place.append((frame.f_code, frame.f_lasti))
+            frame = frame.f_back
         variables = found.f_locals
-        site = cls(dict(variables), place)
+        site = cls(dict(variables), tuple(place))
         # Before Python 3.13 a function's frame keeps this snapshot, and with it all tensors that the function deletes
         # or replaces, until it returns. The variables themselves are elsewhere; those of a module are this dict.
         if isinstance(variables, dict) and found.f_code.co_flags & inspect.CO_OPTIMIZED:
