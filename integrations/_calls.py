@@ -192,20 +192,17 @@ class RasterizerCall(Call):
         super().put(field, value)
 
 
-def check_installed(rasterizers: Iterable[str]) -> None:
-    """Raise ImportError unless the module of one, ``module:Class``, can be found; does not import it."""
-    if not _installed(rasterizers):
+def find_installed(rasterizers: Iterable[str]) -> list[str]:
+    """Return the modules of those, ``module:Class``, that can be found, not imported; ImportError if there is none."""
+    modules = dict.fromkeys(rasterizer.partition(":")[0] for rasterizer in rasterizers)
+    found = [name for name in modules if name in sys.modules or find_spec(name.partition(".")[0]) is not None]
+    if not found:
         raise ImportError(
             f"none of the rasterizers {', '.join(rasterizers)} is installed. Install the one in the submodules of your "
             "code base (it needs CUDA), pass your own class as rasterizer=..., in the launcher --rasterizer "
             "module:Class, or run the code base without CUDA: python -m ca_reg.integrations.run --cpu train.py ..."
         )
-
-
-def _installed(rasterizers: Iterable[str]) -> list[str]:
-    """Return the modules of rasterizers that can be found."""
-    modules = dict.fromkeys(rasterizer.partition(":")[0] for rasterizer in rasterizers)
-    return [name for name in modules if name in sys.modules or find_spec(name.partition(".")[0]) is not None]
+    return found
 
 
 def class_in(module: ModuleType, name: str) -> type | None:
@@ -216,9 +213,8 @@ def class_in(module: ModuleType, name: str) -> type | None:
 
 def rasterizer_classes() -> list[type]:
     """Import the installed rasterizers and return their classes; raise ImportError if there are none."""
-    check_installed(RASTERIZERS)
     name = RASTERIZERS[0].partition(":")[2]
-    found = [class_in(import_module(module), name) for module in _installed(RASTERIZERS)]
+    found = [class_in(import_module(module), name) for module in find_installed(RASTERIZERS)]
     return list(dict.fromkeys(cls for cls in found if cls is not None))
 
 
@@ -264,7 +260,7 @@ def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
 
 
 def white_alpha(call: RasterizerCall) -> Tensor:
-    """Measure the accumulated alpha (H, W) of a call by repeating it with all colors 1 over a background of 0."""
+    """Measure the accumulated alpha (H, W) of a finished call: make it again with all colors 1 over black."""
     if not call.takes("colors_precomp"):
         raise ValueError(
             f"{type(call.rasterizer).__name__} takes no colors_precomp, by which its alpha could be measured in white: "
@@ -272,18 +268,15 @@ def white_alpha(call: RasterizerCall) -> Tensor:
         )
     settings = call.rasterizer.raster_settings
     opacities: Tensor = call.arguments["opacities"]
-    before = dict(call.arguments)
-    call.rasterizer.raster_settings = settings._replace(bg=torch.zeros_like(settings.bg))
     # "dc" holds the first band where a rasterizer takes it separately.
-    call.arguments.update({name: None for name in ("shs", "dc") if name in before})
+    call.arguments.update({name: None for name in ("shs", "dc") if name in call.arguments})
     call.arguments["colors_precomp"] = opacities.new_ones(opacities.shape[0], 3)
+    call.rasterizer.raster_settings = settings._replace(bg=torch.zeros_like(settings.bg))
     try:
         with torch.no_grad():
             returned = call()
     finally:
         call.rasterizer.raster_settings = settings
-        call.arguments.clear()
-        call.arguments.update(before)
     size = (3, settings.image_height, settings.image_width)
     white = [x for x in returned if isinstance(x, Tensor) and tuple(x.shape) == size]
     if len(white) != 1:

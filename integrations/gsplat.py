@@ -58,7 +58,6 @@ def regularized(
         generator: source of the draws, passed to every member.
 
     Raises:
-        TypeError: if ``rasterization`` has no argument ``opacities``, or ``regularizer`` is not a module.
         ValueError: if ``rasterization`` is regularized already, or the regularizer learns per Gaussian or needs what no
             call can supply; at a call, if that lacks what the regularizer needs.
         RuntimeError: at a call in training that drops Gaussians, if there are no radii to zero: in packed mode where
@@ -140,7 +139,7 @@ class Regularized:
         return out
 
     def evaluate(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Rasterize with the test-time values, whatever the mode; otherwise like a call."""
+        """Rasterize with the test-time values, whatever the mode."""
         out: tuple[Any, ...] = self._eager(args, kwargs, trains=False)
         return out
 

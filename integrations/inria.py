@@ -25,7 +25,7 @@ from ._calls import (
     CallSite,
     RasterizerCall,
     chain_of,
-    check_installed,
+    find_installed,
     hide_dropped,
     rasterizer_classes,
     second_regularizers,
@@ -38,8 +38,7 @@ from ._steps import Iterations, ModelSteps, Steps, leaf_of
 __all__ = ["DEFAULT_MODEL", "RasterizerHook", "Scope", "Steps", "render_fn"]
 
 Scope = Literal["main", "all"]
-"""Which training renders of an iteration are regularized: the first of every model and further ones from the same place
-in the script (a batch), or all; always with the same mask."""
+"""Which training renders of an iteration are regularized, see :class:`RasterizerHook`."""
 
 DEFAULT_MODEL = "scene.gaussian_model:GaussianModel"
 _WORD = 2**64 - 1
@@ -80,13 +79,9 @@ class RasterizerHook(Hook):
             training steps without a render, beyond which an error is raised; 0 for no limit.
         allow_zeros: accept exact zeros among the incoming opacities, by default taken for the code base's own dropout.
 
-    Attributes:
-        tally: counts of what was done so far.
-
     Raises:
-        TypeError: if ``regularizer`` is not a module or takes no ``generator``, or a number is not an integer.
-        ValueError: if ``scope`` or ``steps`` is unknown, ``seed`` or ``patience`` negative, the regularizer empty or
-            one that learns per Gaussian; at a render, if that lacks what the regularizer needs.
+        TypeError: if ``regularizer`` is not a module or takes no ``generator``.
+        ValueError: if the regularizer is empty or learns per Gaussian; at a render, if that lacks what it needs.
 
     Example:
         >>> class GaussianRasterizer(nn.Module):
@@ -155,7 +150,7 @@ class RasterizerHook(Hook):
         if self._patched is not None:
             raise RuntimeError("this hook is installed already; uninstall it first.")
         if self._rasterizer is None:
-            check_installed((*self._rasterizers, *self._candidates))
+            find_installed((*self._rasterizers, *self._candidates))
         self._patched = PatchedClasses(
             self._rasterizers,
             self._candidates,
