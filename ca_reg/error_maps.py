@@ -171,15 +171,16 @@ def error_map(
     check_callable(render_fn, "render_fn")
     check_opacity(opacity)
     check_rate(p)
-    image, alpha = read_rendering(render_fn(opacity * (1 - p) if p else opacity, view), layout=layout)
+    expected = opacity.detach() * (1 - p)
+    image, alpha = read_rendering(render_fn(expected.clone(), view), layout=layout)  # a copy: it may edit them
     if alpha is None:
         raise ValueError("render_fn must return an alpha beside the image, got the image alone: return (image, alpha).")
     features = {"empty": (1 - alpha).clamp_min(0), "contrast": contrast(image)}
     if moments_fn is not None:
-        moments = moments_fn(opacity, view, Multiplier.dropout(p or PLAIN_RATE), None)
+        moments = moments_fn(opacity.detach().clone(), view, Multiplier.dropout(p or PLAIN_RATE), None)
         features["deviation"] = read_moments(moments, layout=layout).variance.mean(0).clamp_min(0).sqrt()
     if isinstance(moments_fn, ListMoments):
-        features["colors"] = moments_fn.color_variance(opacity * (1 - p) if p else opacity, view).sqrt()
+        features["colors"] = moments_fn.color_variance(expected, view).sqrt()
     return expected_error({**features, **known})
 
 

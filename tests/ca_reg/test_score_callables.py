@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ca_reg import CAMonitor, CAScore, Reason, attribute
+from ca_reg import CAMonitor, CAScore, Reason, attribute, error_map
 from ca_reg.attribution import total_effects
 from ca_reg.functional import Multiplier, alpha_moments, contributions, pixel_moments
 
@@ -142,7 +142,7 @@ def test_a_callable_that_edits_its_opacities_reaches_nobody_else_s(make, drop_ra
     same(found, make(lambda f: f, drop_rate=drop_rate, **SETTINGS)(OPACITY, None))
 
 
-def test_attribution_and_monitor_keep_the_opacities_too(tmp_path):
+def test_attribution_monitor_and_error_map_keep_the_opacities_too(tmp_path):
     opacity = OPACITY.clone()
     score = CAScore.exact(moments, **SETTINGS)
     assert torch.equal(attribute(score, spoiling(shares), opacity, None)[0], attribute(score, shares, OPACITY, None)[0])
@@ -152,6 +152,9 @@ def test_attribution_and_monitor_keep_the_opacities_too(tmp_path):
         score, tmp_path, views={"all": [0, 1]}, every=1, psnr=spoiling(lambda o, v: o.sum().item())
     ) as monitor:
         assert monitor(1, opacity)["psnr/all"] == pytest.approx(OPACITY.sum().item())
+    assert error_map(spoiling(render), opacity, None, moments_fn=spoiling(moments)).psnr == pytest.approx(
+        error_map(render, OPACITY, None, moments_fn=moments).psnr
+    )
     assert torch.equal(opacity, OPACITY)
 
 
