@@ -119,7 +119,8 @@ def read_folder(folder: Path) -> Sources:
     sources = Sources(root=folder)
     for path in sorted(folder.rglob("*.py")):
         inner = path.relative_to(folder).parts
-        if _NOT_READ.isdisjoint(inner) and not any(part.startswith(".") for part in inner):
+        hidden = any(part.startswith(".") for part in inner)
+        if path.is_file() and _NOT_READ.isdisjoint(inner) and not hidden:  # a link may lead nowhere
             sources.read(path, folder)
     return sources
 

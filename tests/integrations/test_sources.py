@@ -110,6 +110,8 @@ def test_the_sources_of_extensions_and_hidden_folders_are_not_read(repository):
     (repository / "tools" / "y.py").write_text("from diff_local import GaussianRasterizer\nimport (\n")
     (repository / "diff_local" / "z.py").write_text("from diff_local import OwnRasterizer\n")
     assert read_folder(repository).rasterizers == {"diff_tools": {"GaussianRasterizer", "PlaneRasterizationSettings"}}
+    (repository / "moved.py").symlink_to(repository / "elsewhere.py")
+    (repository / "folder.py").mkdir()
     assert read_folder(repository).classes == ["diff_tools:GaussianRasterizer"]
     (repository / "diff_local" / "setup.py").touch()  # an extension that is installed from there
     assert set(read_folder(repository).rasterizers) == {"diff_tools", "diff_local"}
