@@ -151,6 +151,8 @@ def _parse(arguments: Sequence[str] | None, *, in_child: bool = False) -> argpar
             parser.error(f"there is no module {options.script}")
     elif not command or (script := find_script(Path(command[0]))) is None:
         parser.error(f"there is no script {' '.join(command[:1])}".rstrip())
+    elif b"\0" in script.read_bytes():
+        parser.error(f"{script} is a program, not a script of Python: name the script itself, without python before it")
     else:
         options.script, options.arguments = script, command[1:]
     options.sources = sources = read_script(options.script)

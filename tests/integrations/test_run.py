@@ -318,6 +318,7 @@ def test_an_installed_command_is_a_script_as_well(tmp_path, monkeypatch):
     [
         (["nowhere.py"], "there is no script nowhere.py"),
         ([], "there is no script"),
+        ([sys.executable, "SCRIPT"], "is a program, not a script of Python"),
         (["-m"], "-m needs the name of a module"),
         (["-m", "nowhere.train"], "there is no module nowhere.train"),
         (["--patience", "-1", "SCRIPT"], "--patience must be at least 0"),
