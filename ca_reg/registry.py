@@ -98,8 +98,8 @@ class Registry(Generic[T]):
         text = text.strip()
         if not text:
             return []
-        # Turn module:Class into module.Class, which Python can parse, outside string literals.
-        source = re.sub(r"('[^']*'|\"[^\"]*\")|(?<=\w):(?=[A-Za-z_])", lambda found: found[1] or ".", text)
+        # Turn module:Class into module.Class, which Python can parse, outside string literals; {1:True} stays.
+        source = re.sub(r"""('[^']*'|"[^"]*")|([A-Za-z_][\w.]*):(?=[A-Za-z_])""", lambda x: x[1] or f"{x[2]}.", text)
         try:
             node: ast.expr = ast.parse(source, mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:

@@ -18,6 +18,11 @@ def test_names_arguments_schedules_and_sums():
     assert len(parse("  ")) == 0
 
 
+def test_a_dictionary_is_a_literal_too():
+    (made,) = Registry("dictionary", dict, of=dict).make("of({1:True, 'a:b':None})")
+    assert made == {1: True, "a:b": None}
+
+
 def test_a_class_in_a_file_of_the_working_directory(tmp_path, monkeypatch):
     (tmp_path / "mine_for_this_test.py").write_text(
         "from ca_reg import IndependentDropout\n"
