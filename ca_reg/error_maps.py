@@ -176,11 +176,12 @@ def error_map(
     if alpha is None:
         raise ValueError("render_fn must return an alpha beside the image, got the image alone: return (image, alpha).")
     features = {"empty": (1 - alpha).clamp_min(0), "contrast": contrast(image)}
+    if isinstance(moments_fn, ListMoments):
+        features["colors"] = moments_fn.color_variance(expected, view).sqrt()
+        layout = "CHW"  # of its moments, whatever that of the renderer
     if moments_fn is not None:
         moments = moments_fn(opacity.detach().clone(), view, Multiplier.dropout(p or PLAIN_RATE), None)
         features["deviation"] = read_moments(moments, layout=layout).variance.mean(0).clamp_min(0).sqrt()
-    if isinstance(moments_fn, ListMoments):
-        features["colors"] = moments_fn.color_variance(expected, view).sqrt()
     return expected_error({**features, **known})
 
 

@@ -76,6 +76,15 @@ def test_what_is_not_covered_is_expected_to_be_wrong():
     assert error[4, 9] > error[4, 2]
 
 
+def test_lists_go_with_a_renderer_of_another_layout():
+    opacity = torch.tensor([0.9, 0.4, 0.6])
+    image, alpha = wall(opacity, None)
+    found = error_map(
+        lambda *_: (image.permute(1, 2, 0), alpha), opacity, None, moments_fn=ListMoments(lists_fn), layout="HWC"
+    )
+    assert torch.equal(found.error, error_map(wall, opacity, None, moments_fn=ListMoments(lists_fn)).error)
+
+
 def test_a_map_of_opacities_in_training_can_be_shown():
     error = error_map(wall, torch.full((4,), 0.9, requires_grad=True), None).error
     assert error.numpy().shape == SIZE
