@@ -182,7 +182,8 @@ class RasterizerHook(Hook):
 
     def step(self, step: int) -> None:
         """Begin a training step, counted from 1; from then on ``update_learning_rate`` is ignored."""
-        self._iterations.step(step)
+        check_count(step, "step", minimum=0)
+        self._iterations.step(int(step))
 
     def problem(self) -> str | None:
         """Describe a failure to regularize and its remedy, as every hook does, or a second dropout; else None."""

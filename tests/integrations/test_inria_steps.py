@@ -6,6 +6,7 @@ import sys
 import weakref
 from types import ModuleType
 
+import numpy as np
 import pytest
 import torch
 from stand_ins.card import counted_synchronizations, pretended_card
@@ -176,6 +177,16 @@ def test_steps_past_the_hook_among_others_are_counted(rasterizer, model_class):
     assert made == 11
     assert "5 training steps had no render" in message
     assert (hook.tally.regularized, hook.tally.lost) == (5, 5)
+
+
+def test_a_step_is_an_integer_of_python_or_numpy(rasterizer):
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer) as hook:
+        hook.step(np.int64(3))
+        make_render(rasterizer)((model := Model()).camera, model, PIPE, BLACK)
+        for step in (3.0, torch.tensor(3)):
+            with pytest.raises(TypeError, match="step must be an integer"):
+                hook.step(step)
+    assert hook.tally.first_step == 3
 
 
 def test_said_steps_without_a_render_are_counted(rasterizer):
