@@ -30,8 +30,7 @@ from ca_reg.types import (
     read_rendering,
 )
 
-__all__ = ["CAScore", "ExactScore", "view_position"]
-
+__all__ = ["CAScore", "ExactScore"]
 
 # Renders are pooled in at most this many groups, which bounds the memory; fewer groups would make the standard error
 # less certain (its relative error is about 1/sqrt(2 (groups - 1)), here 27 %).

@@ -190,16 +190,19 @@ class PatchedClasses:
         self.names.append(f"{rasterizer.__module__}.{rasterizer.__qualname__}")
 
     def _wrap_model(self, model: type) -> None:
-        """Intercept the learning rate updates of a model."""
-        if not _takes_a_step(getattr(model, "update_learning_rate", None)):
+        """Intercept the learning rate updates of a model, if they have an argument, which tells the iteration."""
+        method = getattr(model, "update_learning_rate", None)
+        if method is None or len(inspect.signature(method).parameters) < 2:
             return
 
         def make(update: Callable[..., Any]) -> Callable[..., Any]:
             @functools.wraps(update)
             def update_learning_rate(model: Any, *args: Any, **kwargs: Any) -> Any:
                 given = [*args, *kwargs.values()]  # the iteration first, by whatever name
-                # Called by an override in a subclass, or not for Gaussians, as that of a network that deforms them.
-                if self._updated is model or not given or not _has_opacities(model):
+                # Called by an override in a subclass, or not for Gaussians, as that of a network that deforms them:
+                # these have opacities by some name.
+                has_opacities = any("opacit" in name for name in dir(model))
+                if self._updated is model or not given or not has_opacities:
                     return update(model, *args, **kwargs)
                 self._update(model, int(given[0]))
                 self._updated = model
@@ -212,16 +215,6 @@ class PatchedClasses:
 
         self.models += (model,)
         self._patches.append(ClassPatch(model, "update_learning_rate", make))
-
-
-def _takes_a_step(method: Callable[..., Any] | None) -> bool:
-    """Whether a method takes an argument besides ``self``: without one it cannot tell the iteration."""
-    return method is not None and len(inspect.signature(method).parameters) > 1
-
-
-def _has_opacities(model: Any) -> bool:
-    """Whether a model is one of Gaussians, which have opacities by some name."""
-    return any("opacit" in name for name in dir(model))
 
 
 class _Override(NamedTuple):

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from ca_reg import CAScore, Params
-from ca_reg.result import COLUMNS, CASummary, row_of, summary_of
-from ca_reg.score import view_position
+from ca_reg.result import COLUMNS, CASummary, row_of, summary_of, view_position
 from ca_reg.types import RenderFn
 
 __all__ = ["CAScoreMetric"]
