@@ -10,9 +10,11 @@ from stand_ins.inria import PIPE, Model, make_render, settings_of
 
 from ca_reg import Chain, Draw, IndependentDropout, Params, Regularizer
 from ca_reg.integrations._calls import RasterizerCall, Signature, forward_signature
+from ca_reg.integrations._report import Skip
 from ca_reg.integrations.gsplat import regularized
 from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.regularizer import Learned
+from ca_reg.regularizers import parse
 from ca_reg.schedules import LinearRamp
 
 BLACK = torch.zeros(3)
@@ -199,6 +201,16 @@ def test_what_a_render_lacks_is_refused_by_name(rasterizer, regularizer, argumen
         hook.step(1)
         with pytest.raises(ValueError, match=message):
             render(model.camera, model, PIPE, BLACK, **arguments)
+
+
+def test_what_a_test_render_lacks_is_no_matter_to_what_leaves_it_alone(rasterizer):
+    model, render = Model(), make_render(rasterizer)
+    plain = {"shs": None, "colors_precomp": torch.rand(len(model.get_xyz), 3)}
+    with torch.no_grad():
+        expected = render(model.camera, model, PIPE, BLACK, **plain)["render"]
+    with RasterizerHook(parse("sh_noise(0.5)"), rasterizer=rasterizer, patience=0) as hook, torch.no_grad():
+        assert torch.equal(render(model.camera, model, PIPE, BLACK, **plain)["render"], expected)
+    assert hook.tally.skipped[Skip.NOTHING_TO_SCALE] == 1
 
 
 def test_what_no_render_has_is_refused_before_the_training(rasterizer):
