@@ -64,25 +64,15 @@ def orbit_views(
 ) -> list[Camera]:
     """Place cameras on a circle around a model, all looking at its center.
 
-    The `bounding_sphere` spans the share ``fill`` of the shorter side of the picture. In a y-down world the first
-    camera of a full circle faces +z, looking slightly down, and the others follow at equal angles, moving towards +x;
-    an arc is centered on that first camera and has a camera at both ends.
+    The `bounding_sphere` of means and opacities spans the share ``fill``, in (0, 1], of the shorter side of the
+    picture, whose sides are in pixels. In a y-down world the first camera of a full circle faces +z, looking slightly
+    down, and the others follow at equal angles, moving towards +x. An ``arc`` below 2 pi, radians, is centered on that
+    first camera and has one at both ends: a model captured from one side (LLFF) looks sensible on a small one only.
 
     Convention: the world is y down and z forward (OpenCV) unless told otherwise, as in most captures: a PLY file does
     not say where up is, nor do the axes of inertia (a plant is longest along it, a table shortest). Blender and
     nerfstudio have z up. The cameras are OpenCV.
     The renderer clips at depth 0.2: models with a radius below about 0.13 must be enlarged first.
-
-    Args:
-        means: as for `bounding_sphere`.
-        opacities: as for `bounding_sphere`.
-        count: number of cameras.
-        width: of the pictures, pixels.
-        height: of the pictures, pixels.
-        fill: diameter of the sphere as a share of the shorter side, in (0, 1].
-        world: the vertical axis.
-        arc: angle between the first and the last camera, radians, in (0, 2 pi]; a full circle has no camera twice.
-            A model captured from one side (LLFF scenes) looks sensible on a small arc only.
 
     Raises:
         ValueError: if an argument is out of range, or `bounding_sphere` raises it.
