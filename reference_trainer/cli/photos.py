@@ -139,7 +139,8 @@ class Run:
             raise ValueError(f"{self.photos} holds {held} that can be read; it takes at least 2, better 3 or more.")
         about: dict[str, Any] = {"frames": self.frames, "files": {path.name: path.stat().st_size for path in sources}}
         with run_lock(self.folder):
-            self._begin_again("photographs", "poses", "train")
+            if self.again == "photographs":  # else those that changed are refused with everything in place
+                self._begin_again("photographs", "poses", "train")
             before = read_json(mark) if mark.exists() else {}
             if not before:
                 write_json(mark, before)  # the folder is ours from now on, should this be interrupted
@@ -152,6 +153,7 @@ class Run:
                     f"{self.folder} was made from other photographs, see {', '.join(sorted(changed))}: give another "
                     "--out, or begin again with --from photographs."
                 )
+            self._begin_again("poses", "train")
         return scene
 
     def _sizes(self, scene: Path) -> tuple[tuple[int, int], int]:

@@ -188,6 +188,17 @@ def test_what_cannot_work_is_refused_at_once(garden, capsys, monkeypatch):
     assert "--quality" in refused(["run", "garden", "--quick", "--quality"], capsys)
 
 
+def test_photographs_that_changed_are_refused_before_anything_is_deleted(garden, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(photos, "find_spec", lambda name: name)
+    (tmp_path / "out").mkdir()
+    about = {"frames": 16, "files": {"train_0.png": 1}}
+    (tmp_path / "out" / "photographs.json").write_text(json.dumps(about))
+    (tmp_path / "out" / "checkpoint.pt").write_bytes(b"an hour of training")
+    for step in ("poses", "train"):
+        assert "other photographs" in refused(["run", "garden", "--out", "out", "--from", step], capsys)
+        assert (tmp_path / "out" / "checkpoint.pt").exists()
+
+
 @pytest.mark.slow
 def test_a_folder_with_one_video_is_enough(tmp_path, capsys, monkeypatch):
     av = pytest.importorskip("av", reason="needs ca_reg[photos]")
