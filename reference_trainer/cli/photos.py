@@ -91,7 +91,13 @@ class Run:
     @property
     def folder(self) -> Path:
         """Where everything is written."""
-        return self.out or Path("runs", self.photos.resolve().stem)
+        return self.out or Path("runs", self._name)
+
+    @property
+    def _name(self) -> str:
+        """Name of the photographs, of a video without its ending."""
+        place = self.photos.resolve()
+        return place.name if place.is_dir() else place.stem
 
     def check(self) -> None:
         """Refuse what cannot work, before anything heavy is imported."""
@@ -128,7 +134,7 @@ class Run:
         sources, wrong = sort_photographs(self.photos)
         for name, why in wrong.items():
             print(f"not read, and left out: {'' if name in why else f'{name}: '}{why}", file=sys.stderr)
-        scene, mark = self.folder / SCENE / self.photos.resolve().stem, self.folder / MARK
+        scene, mark = self.folder / SCENE / self._name, self.folder / MARK
         with suppress(ValueError, FileNotFoundError):
             find_reader(self.photos, "auto")
             scene = self.photos

@@ -188,6 +188,13 @@ def test_what_cannot_work_is_refused_at_once(garden, capsys, monkeypatch):
     assert "--quality" in refused(["run", "garden", "--quick", "--quality"], capsys)
 
 
+def test_folders_with_a_dot_in_their_names_are_not_one(tmp_path):
+    (tmp_path / "walk.1").mkdir()
+    (tmp_path / "walk.mp4").touch()
+    names = [photos.Run(tmp_path / name).folder.name for name in ("walk.1", "walk.mp4")]
+    assert names == ["walk.1", "walk"]
+
+
 def test_photographs_that_changed_are_refused_before_anything_is_deleted(garden, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(photos, "find_spec", lambda name: name)
     (tmp_path / "out").mkdir()
