@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 import shutil
 import sqlite3
@@ -86,7 +87,7 @@ def find_poses(
         FileNotFoundError: if there is no such folder.
         ValueError: if it holds fewer than two photographs, one is damaged or unknown to COLMAP, they show too little in
             common for any camera, or there is no such camera model.
-        FileExistsError: if the scene has cameras already.
+        FileExistsError: if the scene has cameras already, or another photograph of a name.
         OSError: if it cannot be written.
     """
     known = [model.name for model in CAMERA_MODELS]
@@ -99,6 +100,12 @@ def find_poses(
         raise ValueError(f"{photos[0].parent} holds 1 photograph, and depth needs at least 2: take another one.")
     if found := colmap_folders(out):
         raise FileExistsError(f"{out} has cameras already, in {found[0]}: train on it, or delete them to find others.")
+    images = out / "images"
+    there = out.resolve() == scene.resolve() or images.resolve() == photos[0].parent.resolve()
+    copies = {} if there else {photo: images / photo.name for photo in photos}
+    for photo, copy in copies.items():
+        if copy.exists() and not filecmp.cmp(photo, copy):
+            raise FileExistsError(f"{images} holds another {photo.name}, which is not overwritten: give another --out.")
     for photo in photos:
         decode_image(photo)  # COLMAP takes what is left of a truncated one
     with tempfile.TemporaryDirectory() as work:
@@ -110,10 +117,9 @@ def find_poses(
                 "from in between, or take the poses of VGGT or InstantSplat."
             )
         registered = {image.name for image in model.images.values() if image.has_pose}
-        if out.resolve() != scene.resolve():
-            (out / "images").mkdir(parents=True, exist_ok=True)
-            for photo in photos:
-                shutil.copy2(photo, out / "images")
+        for photo, copy in copies.items():
+            images.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(photo, copy)
         _write(model, out / "sparse" / "0")
     return FoundPoses(
         out / "sparse" / "0",

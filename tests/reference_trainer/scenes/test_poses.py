@@ -174,6 +174,23 @@ def test_a_photograph_of_another_format_is_not_passed_over_in_silence(noise, mon
     assert "not read: IMG_3.HEIC. Save them as JPEG or PNG" in said
 
 
+def test_the_folder_of_the_photographs_becomes_that_of_a_scene(noise, monkeypatch):
+    monkeypatch.setattr(poses, "_reconstruct", lambda *_: reconstruction())
+    images = noise.rename(noise.with_name("images"))
+    before = {path.name: path.read_bytes() for path in images.iterdir()}
+    assert find_poses(images, images.parent).folder == images.parent / "sparse" / "0"
+    assert {path.name: path.read_bytes() for path in images.iterdir()} == before
+
+
+def test_photographs_of_somebody_else_are_not_overwritten(noise, tmp_path, monkeypatch):
+    (other := tmp_path / "other" / "images").mkdir(parents=True)
+    (other / "1.png").write_bytes((noise / "0.png").read_bytes())
+    monkeypatch.setattr(poses, "_reconstruct", lambda *_: pytest.fail("COLMAP was started"))
+    with pytest.raises(FileExistsError, match=r"holds another 1\.png"):
+        find_poses(noise, other.parent)
+    assert (other / "1.png").read_bytes() == (noise / "0.png").read_bytes()
+
+
 def test_poses_ends_with_the_best_setting_known(noise, monkeypatch, capsys):
     """A command to paste: that of a training with dropout and opacity decay, which `train` understands."""
     monkeypatch.setattr(poses, "_reconstruct", lambda *_: reconstruction())
