@@ -100,7 +100,9 @@ def find_poses(
         raise ValueError(f"{photos[0].parent} holds 1 photograph, and depth needs at least 2: take another one.")
     if found := colmap_folders(out):
         raise FileExistsError(f"{out} has cameras already, in {found[0]}: train on it, or delete them to find others.")
-    images = out / "images"
+    images, place = out / "images", out / "sparse" / "0"
+    if place.exists() and any(place.iterdir()):
+        raise FileExistsError(f"{place} holds files, but no cameras: delete them, or give another --out.")
     there = out.resolve() == scene.resolve() or images.resolve() == photos[0].parent.resolve()
     copies = {} if there else {photo: images / photo.name for photo in photos}
     for photo, copy in copies.items():
@@ -120,9 +122,9 @@ def find_poses(
         for photo, copy in copies.items():
             images.mkdir(parents=True, exist_ok=True)
             shutil.copy2(photo, copy)
-        _write(model, out / "sparse" / "0")
+        _write(model, place)
     return FoundPoses(
-        out / "sparse" / "0",
+        place,
         tuple(photo.name for photo in photos if photo.name in registered),
         tuple(photo.name for photo in photos if photo.name not in registered),
         tuple(unreadable_photographs(photos[0].parent)),

@@ -188,6 +188,10 @@ def test_photographs_of_somebody_else_are_not_overwritten(noise, tmp_path, monke
     monkeypatch.setattr(poses, "_reconstruct", lambda *_: pytest.fail("COLMAP was started"))
     with pytest.raises(FileExistsError, match=r"holds another 1\.png"):
         find_poses(noise, other.parent)
+    (noise / "sparse/0").mkdir(parents=True)
+    (noise / "sparse/0/project.ini").touch()
+    with pytest.raises(FileExistsError, match="holds files, but no cameras"):
+        find_poses(noise)
     assert (other / "1.png").read_bytes() == (noise / "0.png").read_bytes()
 
 
