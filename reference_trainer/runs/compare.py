@@ -189,11 +189,14 @@ def _report(comparison: Comparison, out: Path) -> None:
         _log.info("no figure of CA and PSNR against the iteration: %s", error)
     views = next(iter(comparison.runs.values()))[0]["views"]
     splits, drawn = {view["split"] for view in views}, list[Path]()
-    for split in sorted(splits - {"train"}) or splits:
-        for name in file_names([view["name"] for view in views if view["split"] == split]):
-            drawn.append(out / f"{split}_{name}.png")
-            comparison_figure(first, drawn[-1], view=name, split=split)
-    _log.info("every view under each strategy: %s%s", drawn[0], f" and {len(drawn) - 1} more" * (len(drawn) > 1))
+    try:
+        for split in sorted(splits - {"train"}) or splits:
+            for name in file_names([view["name"] for view in views if view["split"] == split]):
+                drawn.append(out / f"{split}_{name}.png")
+                comparison_figure(first, drawn[-1], view=name, split=split)
+        _log.info("every view under each strategy: %s%s", drawn[0], f" and {len(drawn) - 1} more" * (len(drawn) > 1))
+    except FileNotFoundError as error:  # somebody has deleted them
+        _log.info("no pictures of the views under each strategy: %s", error)
     _log.info(
         "table and all numbers: %s, %s; curves: tensorboard --logdir %s", out / TABLE, COMPARISON, shlex.quote(str(out))
     )

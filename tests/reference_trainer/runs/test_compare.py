@@ -2,6 +2,7 @@ import dataclasses
 import json
 import os
 import shlex
+import shutil
 import statistics
 from pathlib import Path
 
@@ -196,11 +197,16 @@ def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, li
             save_png(folder / "views" / "test" / f"{name}_panel.png", torch.rand(3, 8, width))
         if lines is not None:
             (folder / LOG_NAME).write_text(lines)
-    report({out: Comparison({"baseline": [results], "dropout": [results]}, {})})
+    comparisons = {out: Comparison({"baseline": [results], "dropout": [results]}, {})}
+    report(comparisons)
     assert any(line.startswith("no figure of CA and PSNR against the iteration: ") for line in said)
     assert sorted(path.name for path in out.glob("*.png")) == ["test_a_r_0.png", "test_b_r_0.png"]
     (logs,) = (line for line in said if "tensorboard" in line)
     assert shlex.split(logs.partition("curves: ")[2]) == ["tensorboard", "--logdir", str(out)]
+    shutil.rmtree(out / "baseline/seed_0/views")  # takes nothing but these pictures from a comparison
+    report(comparisons)
+    assert any(line.startswith("no pictures of the views under each strategy: ") for line in said)
+    assert "tensorboard" in said[-1]
 
 
 def test_a_worker_that_does_not_share_the_folder_does_not_train(tmp_path, options):
