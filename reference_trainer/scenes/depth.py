@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reference_trainer.scenes.frames import ASPECT_TOLERANCE, Frame, fitted
+from reference_trainer.scenes.frames import Frame, check_shape, fitted
 from reference_trainer.scenes.images import path_inside
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud, Scene, View
@@ -32,12 +32,8 @@ def with_prior(view: View, frame: Frame, root: Path, options: SceneOptions) -> V
     folder = root / options.depth.removesuffix(":inverse")
     path = _find(frame, folder)
     prior = read_depth(path)
-    (rows, columns), camera = prior.shape, frame.camera.resized(view.camera.width, view.camera.height)
-    if abs(columns / rows * camera.height / camera.width - 1) > ASPECT_TOLERANCE:
-        raise ValueError(
-            f"{path} is {columns}x{rows}, which is not the shape of its photograph {frame.path} at {camera.width}x"
-            f"{camera.height}: the aspect ratios must agree."
-        )
+    camera = frame.camera.resized(view.camera.width, view.camera.height)
+    check_shape(path, prior, frame, camera)
     known = prior.isfinite()
     low, high = (prior[known].min(), prior[known].max()) if bool(known.any()) else (0.0, 0.0)
     layers = torch.stack([((prior - low) / (high - low)).where(known, 0), known.to(prior)])

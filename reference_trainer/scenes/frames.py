@@ -15,7 +15,7 @@ from reference_trainer.camera import Camera
 from reference_trainer.scenes.images import composite, read_image, resize_image
 from reference_trainer.scenes.scene import View
 
-__all__ = ["Frame", "corner_displacement", "distort", "fitted", "load_view", "undistort", "view_matrix"]
+__all__ = ["Frame", "check_shape", "corner_displacement", "distort", "fitted", "load_view", "undistort", "view_matrix"]
 
 # Rounding to whole pixels changes the aspect ratio by about 1 / height; a wrong picture folder changes it by more.
 ASPECT_TOLERANCE = 0.02
@@ -56,6 +56,20 @@ def view_matrix(axes: NDArray[np.float64], position: NDArray[np.float64]) -> Ten
     return torch.from_numpy(pose)
 
 
+def check_shape(path: Path, layer: Tensor, frame: Frame, camera: Camera) -> None:
+    """Refuse a file, read as (..., H, W), that cannot be of a frame's photograph: its aspect ratio is not the camera's.
+
+    Raises:
+        ValueError: with both sizes.
+    """
+    height, width = layer.shape[-2:]
+    if abs(width / height * camera.height / camera.width - 1) > ASPECT_TOLERANCE:
+        raise ValueError(
+            f"{path} is {width}x{height}, which is not the shape of its photograph {frame.path} at {camera.width}x"
+            f"{camera.height}: the aspect ratios must agree."
+        )
+
+
 def fitted(layer: Tensor, camera: Camera, distortion: Sequence[float], mode: str = "bicubic") -> tuple[Tensor, Camera]:
     """Resize a picture (C, H, W) to the size of its camera, then undo the distortion, if any; return both.
 
@@ -74,7 +88,8 @@ def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0, undis
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is no image, its aspect ratio is not the camera's, or its distortion cannot be undone.
+        ValueError: if the file is no image, its aspect ratio or that of its mask is not the camera's, or its distortion
+            cannot be undone.
     """
     image, alpha = read_image(frame.path)
     height, width = image.shape[1:]
@@ -86,7 +101,9 @@ def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0, undis
         )
     layers = {"image": image if alpha is None else composite(image, alpha, background)}
     layers |= {} if alpha is None else {"alpha": alpha[None]}
-    layers |= {} if frame.mask is None else {"mask": read_image(frame.mask)[0].mean(0, keepdim=True)}
+    if frame.mask is not None:
+        layers["mask"] = read_image(frame.mask)[0].mean(0, keepdim=True)
+        check_shape(frame.mask, layers["mask"], frame, frame.camera.resized(width, height))
     camera = frame.camera.resized(max(1, round(width / downscale)), max(1, round(height / downscale)))
     fits = {name: fitted(layer, camera, frame.distortion if undistort else ()) for name, layer in layers.items()}
     image, camera = fits.pop("image")

@@ -221,6 +221,9 @@ def test_masks_of_nerfstudio(nerfstudio, save_image):
     assert [view.mask is None for view in scene.train] == [True, True, False]
     assert scene.train[2].mask.equal((torch.arange(64) < 32).float().expand(48, 64))
     assert "masks: scores count what is white in them" in str(scene)
+    save_image(nerfstudio / "masks" / "c.png", np.zeros((48, 48), np.uint8))  # of another crop
+    with pytest.raises(ValueError, match=r"c\.png is 48x48, which is not the shape of its photograph .* at 64x48"):
+        load_scene(SceneOptions(nerfstudio, undistort=False))
 
 
 @pytest.mark.parametrize(
