@@ -91,7 +91,8 @@ class Chain(Regularizer):
                 x = member.regularize(x, generator)
                 draws.append(member.last)  # this thread's
             else:
-                member.check_needs(x)
+                if member.renders_mean:
+                    member.check_needs(x)
                 x = member.expected(x)
                 draws.append(None)
         self._remember(_combine_draws(draws))

@@ -32,6 +32,13 @@ class ScaleUp(Regularizer):
         return x._replace(scales=x.scales * draw.value)
 
 
+def test_a_member_that_is_switched_off_asks_for_nothing():
+    chain = Chain(ScaleUp().eval(), GaussianDropout(0.5))
+    with pytest.raises(ValueError, match="needs scales"):
+        Chain(ScaleUp(), GaussianDropout(0.5))(OPACITY)
+    assert torch.equal(chain(OPACITY) > 0, chain.keep)
+
+
 def all_masks(n):
     return [torch.tensor(mask) for mask in itertools.product([False, True], repeat=n)]
 
