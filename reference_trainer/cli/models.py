@@ -247,6 +247,7 @@ class Bake:
     out: Path | None = None
     """The file to write; by default <ply>_for_viewers.ply. An .spz, a tenth of the size, or an .sog is for viewers in
     the web, and needs ca_reg[web]."""
+    trust: Trust = ()
 
     def check(self) -> None:
         """Refuse what cannot work, before anything heavy is imported."""
@@ -258,10 +259,10 @@ class Bake:
 
         out = self.out or self.ply.with_name(f"{self.ply.stem}_for_viewers.ply")
         if out.suffix.lower() in SMALL:
-            compress_ply(self.ply, out, regularizer=self.regularizer)
+            compress_ply(self.ply, out, regularizer=self.regularizer, trust=self.trust)
             print(f"{out}: {out.stat().st_size / 1e6:.1f} MB, opacities those of the test")
             return
-        regularizer = bake_ply(self.ply, out, regularizer=self.regularizer)
+        regularizer = bake_ply(self.ply, out, regularizer=self.regularizer, trust=self.trust)
         print(f"{out}: opacities are those of the test after {regularizer}, and marked so")
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from reference_trainer.cli.options import Device, check_model
+from reference_trainer.cli.options import Device, Trust, check_model
 from reference_trainer.files import is_ply
 from reference_trainer.scenes.options import OrbitOptions
 
@@ -33,6 +33,7 @@ class ErrorRuntime:
     """Largest number of renders."""
     seeds: int = 3
     """Number of independent sequences of masks."""
+    trust: Trust = ()
     device: Device = "cpu"
 
     def check(self) -> None:
@@ -44,8 +45,8 @@ class ErrorRuntime:
         from reference_trainer.studies.error_runtime import error_runtime_study
         from reference_trainer.studies.study import run_study
 
-        study = error_runtime_study(self.sources, max_samples=self.max_samples, seeds=self.seeds, device=self.device)
-        run_study(study, self.out)
+        how: dict[str, Any] = {"max_samples": self.max_samples, "seeds": self.seeds, "device": self.device}
+        run_study(error_runtime_study(self.sources, trust=self.trust, **how), self.out)
 
 
 @dataclass(frozen=True)

@@ -33,12 +33,13 @@ SMALL = (".spz", ".sog")
 _log = logging.getLogger(__name__)
 
 
-def bake_ply(source: Path, target: Path, *, regularizer: str | None = None) -> str:
+def bake_ply(source: Path, target: Path, *, regularizer: str | None = None, trust: Collection[str] = ()) -> str:
     """Write a PLY with a model's test-time opacities, such as those times 1 - p after dropout p.
 
     A header comment records what was done, so that no program of this package does it again. The layout is that of
     `save_ply`; unknown properties are dropped. ``source`` holds plain opacities; ``regularizer`` says what it was
-    trained with, such as ``"dropout(0.2)"``, if the PLY does not. Returns the expression of the regularizers.
+    trained with, such as ``"dropout(0.2)"``, if the PLY does not; ``trust`` is as for `load_run`. Returns the
+    expression of the regularizers.
 
     Raises:
         ValueError: if the regularizers are unknown or cannot be parsed, the test-time opacities are the plain ones or
@@ -48,7 +49,7 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None) -> s
     """
     if target.exists():
         raise FileExistsError(f"{target} exists already: give another --out, or delete it.")
-    model, facts = load_plain_ply_model(source, regularizer=regularizer)
+    model, facts = load_plain_ply_model(source, regularizer=regularizer, trust=trust)
     if not facts.regularizer:
         raise ValueError(f"{source} does not say what it was trained with: give --regularizer, such as 'dropout(0.2)'.")
     if model.depends_on_camera:
@@ -59,11 +60,11 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None) -> s
     return facts.regularizer
 
 
-def compress_ply(source: Path, target: Path, *, regularizer: str | None = None) -> None:
+def compress_ply(source: Path, target: Path, *, regularizer: str | None = None, trust: Collection[str] = ()) -> None:
     """Write a model with its test-time opacities as one of the small files that viewers in the web read.
 
     The opacities of ``source`` are plain or of the test already; ``target`` is one of `SMALL` by its name. SPZ takes a
-    tenth of a PLY. ``regularizer`` is as for `bake_ply`.
+    tenth of a PLY. ``regularizer`` and ``trust`` are as for `bake_ply`.
 
     Raises:
         ImportError: if GaussForge is missing.
@@ -76,7 +77,7 @@ def compress_ply(source: Path, target: Path, *, regularizer: str | None = None) 
         raise ImportError(f"{target.suffix} files need GaussForge: pip install 'ca_reg[web]'.") from error
     if target.exists():
         raise FileExistsError(f"{target} exists already: give another --out, or delete it.")
-    model, facts = load_ply_model(source, background=torch.zeros(3), regularizer=regularizer)
+    model, facts = load_ply_model(source, background=torch.zeros(3), regularizer=regularizer, trust=trust)
     if model.depends_on_camera:
         raise ValueError(f"what is rendered after {facts.regularizer} depends on the camera: no file can hold it.")
     with tempfile.TemporaryDirectory() as work:

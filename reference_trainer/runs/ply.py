@@ -112,10 +112,11 @@ def load_ply_model(
 
 
 def load_plain_ply_model(
-    ply: Path, *, regularizer: str | None = None, device: str = "cpu"
+    ply: Path, *, regularizer: str | None = None, device: str = "cpu", trust: Collection[str] = ()
 ) -> tuple[TrainedModel, PlyFacts]:
     """Do as `load_ply_model` over black, with a ValueError unless the opacities are plain."""
-    model, facts = load_ply_model(ply, background=torch.zeros(3), regularizer=regularizer, device=device)
+    shared: dict[str, Any] = {"regularizer": regularizer, "device": device, "trust": trust}
+    model, facts = load_ply_model(ply, background=torch.zeros(3), **shared)
     if facts.for_rendering or facts.opacity_scale != 1:
         by = "those of the test" if facts.for_rendering else f"scaled by {facts.opacity_scale:g}"
         raise ValueError(f"the opacities of {ply} are {by} already: give the PLY with plain ones.")

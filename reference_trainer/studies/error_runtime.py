@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,13 +42,18 @@ PICTURE = 256  # side length of the picture of a PLY, pixels
 
 
 def error_runtime_study(
-    sources: Sequence[Path], *, max_samples: int = 1024, seeds: int = 3, device: str = "cpu"
+    sources: Sequence[Path],
+    *,
+    max_samples: int = 1024,
+    seeds: int = 3,
+    device: str = "cpu",
+    trust: Collection[str] = (),
 ) -> Study:
     """Declare the study for runs of this package, by their folders, and for any PLY files.
 
     A run is measured at its first test view, or training view if there is none; a PLY at the first camera of an orbit,
     over black. Both use the plain opacities: CA is defined without the test-time scaling. ``max_samples`` is the
-    largest K, a power of two of at least 16; ``seeds`` the number of Monte Carlo runs.
+    largest K, a power of two of at least 16; ``seeds`` the number of Monte Carlo runs; ``trust`` is as for `load_run`.
 
     Raises:
         FileNotFoundError: if a folder holds no run.
@@ -66,19 +71,19 @@ def error_runtime_study(
         raise ValueError(f"sources must have different names, got {[str(source) for source in sources]}.")
     settings = {"max_samples": max_samples, "seeds": seeds, "device": device}
     cases = {name: {"source": source, **settings} for name, source in named.items()}
-    return Study("error_runtime", _measure, cases, _report, _draw)
+    return Study("error_runtime", functools.partial(_measure, trust=tuple(trust)), cases, _report, _draw)
 
 
-def _measure(source: Path, max_samples: int, seeds: int, device: str) -> Record:
+def _measure(source: Path, max_samples: int, seeds: int, device: str, trust: Collection[str]) -> Record:
     """Measure one source: the checkpoint of a run, or a PLY."""
     view: Viewpoint
     if is_ply(source):
-        model, _ = load_plain_ply_model(source, device=device)
+        model, _ = load_plain_ply_model(source, device=device, trust=trust)
         means, opacities = model.gaussians.means, model.gaussians.opacities
         (camera,) = orbit_views(means, opacities, count=1, width=PICTURE, height=PICTURE)
         view = Viewpoint("orbit", camera)
     else:
-        model, scene = load_run_model(source.parent, device)
+        model, scene = load_run_model(source.parent, device, trust=trust)
         view = (*scene.test, *scene.train)[0].to(device)
     return error_runtime(model, view, max_samples=max_samples, seeds=seeds)
 

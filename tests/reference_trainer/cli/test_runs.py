@@ -263,7 +263,14 @@ def test_own_code_is_trusted_where_the_command_line_names_it(capsys, tmp_path, m
     assert page == ["ca-reg", "report", str(out), "--trust", "own_drop"]
     for command in (["report"], ["evaluate"], ["render"], ["evaluate", "--seed", "1"]):
         assert "say --trust own_drop" in refused([command[0], str(out), *command[1:]], capsys)
-    assert "say --trust own_drop" in refused(["evaluate", str(out / "point_cloud.ply")], capsys)
+    ply = str(out / "point_cloud.ply")
+    bake = ["bake", ply, "--out", str(tmp_path / "baked.ply")]
+    study = ["study", "error-runtime", ply, "--max-samples", "16", "--seeds", "1", "--out", str(tmp_path / "study")]
+    for command in (["evaluate", ply], bake, study):
+        assert "say --trust own_drop" in refused(command, capsys)
+    main([*bake, "--trust", "own_drop"])
+    # Two steps of training cover nothing, which is found once the model is loaded.
+    assert "no pixel of orbit" in refused([*study, "--trust", "own_drop"], capsys)
     main([*page[1:], "--views", "1"])
     main(["evaluate", str(out), "--regularizer", "own_drop:Mine(0.2)", "--samples", "2"])
 

@@ -26,5 +26,5 @@ def test_error_runtime(monkeypatch, tmp_path):
     )
     monkeypatch.setattr(study_module, "run_study", lambda study, out: ran.append(out))
     main(["study", "error-runtime", "r", "s", "--seeds", "2", "--out", "o"])
-    assert declared == [((Path("r"), Path("s")), {"max_samples": 1024, "seeds": 2, "device": "cpu"})]
+    assert declared == [((Path("r"), Path("s")), {"max_samples": 1024, "seeds": 2, "device": "cpu", "trust": ()})]
     assert ran == [Path("o")]
