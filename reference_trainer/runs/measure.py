@@ -100,7 +100,7 @@ def log_what_hangs(model: TrainedModel, scene: Scene | None) -> None:
     if scene is not None and len(scene.train) > 1 and len(model.chain):
         with threads_for(scene.pixels):
             found = guard(model, scene)
-        _log.info("%s%s", found, " To remove them: ca-reg clean PLY --hanging." if found.where else "")
+        _log.info("%s%s", found, " To remove them: ca-reg clean PLY --hanging --scene FOLDER." if found.where else "")
 
 
 @torch.no_grad()
