@@ -1,11 +1,13 @@
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from benchmarks.clean_by_error import error_shares
-from benchmarks.error_map import Quality, Seen, ause, fitted, predict, ranked
+from benchmarks.error_map import Quality, Seen, ause, fitted, predict, ranked, tables
 from reference_trainer.evaluation.shares import blend_weights
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
@@ -69,6 +71,34 @@ def test_models_are_ranked_within_a_scene_and_a_seed():
     }  # fmt: skip
     found = ranked(views, "plain", "dropout")
     assert found == {"dtu-scan24, seed 0": (2.0, -1.0), "fern, seed 0": (1.5, 1.0)}
+
+
+def row(psnr: float, expected: float, ause: float, rival: float) -> dict:
+    figures = dict.fromkeys(("AUSE-RMSE", "AUSE-RMSE, deviation", "Spearman", "Spearman, deviation"), 0.5)
+    figures |= dict.fromkeys(("errors below 2.303 expected", "negative log likelihood", "of the view's true mean"), 0.9)
+    figures |= {f"without {term}": 0.3 for term in ("constant", "deviation", "warp", "hidden*colors")}
+    return figures | {"error map": ause, "deviation": rival, "views": [[0.1, 0.11, psnr, expected]]}
+
+
+def test_tables_have_the_means_and_who_is_ahead():
+    rows = {
+        "fern-plain-0": row(20.0, 23.0, 0.2, 0.25), "lego-plain-0": row(22.0, 23.0, 0.4, 0.3),
+        "fern-recommended-0": row(21.0, 20.0, 0.1, 0.2),
+        "pairs": {"recommended over plain": {"fern, seed 0": (1.0, -3.0)}}, "deciles": [[0.1] * 10, [0.2] * 10],
+    }  # fmt: skip
+    lines = tables(rows).splitlines()
+    assert "| plain | 2 | 0.300 | 0.275 | 1 of 2 |" in lines
+    assert "| recommended | 1 | 0.100 | 0.200 | 1 of 1 |" in lines
+    assert "| Fern | 21.00 / 20.00 | 20.00 / 23.00 |" in lines
+    assert "| recommended over plain | 1 | +1.00 | -3.00 | 0 |" in lines
+    assert "| plain, 2 | 100% | 100% | +2.00 | 2.2 | 100% |" in lines  # off by 3 and 1 dB
+    assert "| **error map** | 0.200 | 0.400 | 0.300 |" in lines
+
+
+def test_the_page_has_the_tables_of_its_rows():
+    here = Path(__file__).parents[1]
+    rows = json.loads((here / "data" / "error_map.json").read_text("utf-8"))
+    assert tables(rows).strip() in (here / "error_map.md").read_text("utf-8")
 
 
 def test_errors_are_handed_out_by_weight_in_the_render(tiny_scene):
