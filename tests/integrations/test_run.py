@@ -346,6 +346,7 @@ def test_wrong_options_are_refused_before_anything_runs(repository, capsys, argu
     assert re.search(message, captured.err)
 
 
+@pytest.mark.slow
 def test_the_module_is_a_program_whose_exit_code_is_the_scripts(repository):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     command = [sys.executable, "-m", "ca_reg.integrations.run", "--dropout", "0.5", "train.py", "1", "--exit"]

@@ -47,6 +47,7 @@ def test_a_file_is_the_old_one_or_the_new_wherever_its_writer_is_killed(tmp_path
     assert seen == ["old"] * 5 + ["the new one"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power", [False, True])
 def test_a_log_is_the_old_one_or_the_shortened_wherever_that_is_killed(tmp_path, power):
     path, lines = tmp_path / "folder" / LOG_NAME, [f'{{"step": {step}}}\n' for step in (1, 2, 3)]
