@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from benchmarks.clean_by_error import error_shares
-from benchmarks.error_map import Quality, Seen, ause, fitted, predict, ranked, tables
+from benchmarks.error_map import Quality, Seen, ause, fitted, predict, ranked
+from benchmarks.error_map_tables import tables
 from reference_trainer.evaluation.shares import blend_weights
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
