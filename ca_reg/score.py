@@ -154,7 +154,8 @@ class CAScore:
             >>> round(CAScore.exact(moments_fn, threshold=0.3)(torch.tensor([0.8]), view=None).value, 6)  # 0 or 0.8
             0.16
         """
-        return ExactScore(moments_fn, neutral, threshold, layout, p, drop_rate, regularizer)
+        common = {"threshold": threshold, "layout": layout, "p": p, "drop_rate": drop_rate, "regularizer": regularizer}
+        return ExactScore(moments_fn, neutral, **common)
 
     @classmethod
     def adaptive(
@@ -189,8 +190,8 @@ class CAScore:
             >>> result.std_error / result.value <= 0.2, result.samples in range(16, 257, 8)
             (True, True)
         """
-        limits = relative_error, max_samples
-        return _AdaptiveScore(render_fn, alpha_fn, seed, limits, threshold, layout, p, drop_rate, regularizer)
+        common = {"threshold": threshold, "layout": layout, "p": p, "drop_rate": drop_rate, "regularizer": regularizer}
+        return _AdaptiveScore(render_fn, relative_error, max_samples, alpha_fn, seed, **common)
 
     def _set(
         self, method: Method, threshold: float, layout: Layout, p: float, drop_rate: float | None,
@@ -376,15 +377,14 @@ class _AdaptiveScore(CAScore):
     """See :meth:`CAScore.adaptive`."""
 
     def __init__(
-        self, render_fn: RenderFn, alpha_fn: RenderFn | None, seed: int, limits: tuple[float, int], *common: Any
+        self, render_fn: RenderFn, target: float, most: int, alpha_fn: RenderFn | None, seed: int, **common: Any
     ) -> None:
-        target, most = limits
         check_finite(target, "relative_error")
         if target <= 0:
             raise ValueError(f"relative_error must be above 0, got {target}; CAScore.exact has no error.")
         check_count(most, "max_samples", minimum=MIN_RENDERS)
         self._set_renderer(render_fn, alpha_fn, seed)
-        self._set("adaptive", *common, ddof=1, seed=self.seed, relative_error=float(target), max_samples=int(most))
+        self._set("adaptive", **common, ddof=1, seed=self.seed, relative_error=float(target), max_samples=int(most))
 
     def _measure(self, x: Params, view: Any, index: int) -> CAResult:
         """Render until the error is small enough.
@@ -435,9 +435,9 @@ class ExactView(NamedTuple):
 class ExactScore(CAScore):
     """See :meth:`CAScore.exact`."""
 
-    def __init__(self, moments_fn: MomentsFn, neutral: bool, *common: Any) -> None:
+    def __init__(self, moments_fn: MomentsFn, neutral: bool, **common: Any) -> None:
         check_callable(moments_fn, "moments_fn", "opacity, view, multiplier, background")
-        self._set("exact_neutral" if neutral else "exact", *common)
+        self._set("exact_neutral" if neutral else "exact", **common)
         self.moments_fn = moments_fn
 
     def _measure(self, x: Params, view: Any, index: int) -> CAResult:

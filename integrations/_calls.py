@@ -109,9 +109,6 @@ class Call:
         if opacities.ndim != 1:
             opacities = opacities.reshape(-1)
         found: dict[str, Any] = {}
-        # A test render of, say, plain colors is no concern of a regularizer that leaves test renders alone.
-        users = [x for x in chain if not testing or type(x).expected is not Regularizer.expected]
-        used = {name for member in users for name in member.needs}
         for name in chain.needs:
             if name in ("opacities", "step"):
                 continue
@@ -119,7 +116,9 @@ class Call:
             if value is not None and name != "view_matrix":
                 value = value.flatten(0, -3 if name == "sh" else -2)
             if value is None or (name != "view_matrix" and len(value) != len(opacities)):
-                if name not in used:
+                # A test render of, say, plain colors is no concern of a regularizer that leaves test renders alone.
+                users = [x for x in chain if name in x.needs and type(x).expected is not Regularizer.expected]
+                if testing and not users:
                     continue
                 raise ValueError(
                     f"{_who(chain, 'needs', name)} needs {name}, which this call of the rasterizer does not have for "
