@@ -180,6 +180,7 @@ class CAResult(_Score):
     def plot(self, ax: Axes | None = None) -> Axes:
         """Plot the root of ``variance``, in units of color, as a heat map; pixels that do not count stay gray.
 
+        The root, because a few pixels hold most of the variance.
         Draws on ``ax``, by default in a new figure, and returns it.
 
         Raises:

@@ -144,6 +144,16 @@ def first_order_map(splats: Splats, multiplier: Multiplier) -> Tensor:
     An approximation that ignores transmittance, the background and what lies behind a splat: hidden splats count like
     visible ones. `ca_reg.functional.first_order_variance` says when it holds. Arguments are those of `render_moments`,
     of the multiplier only the variance counts; returns shape (3, H, W). Always drawn by the torch engine.
+
+    Example:
+        >>> from reference_trainer.camera import Camera
+        >>> from reference_trainer.render import splat
+        >>> camera = Camera(torch.eye(4), 50.0, 50.0, 8.5, 8.5, 16, 16)
+        >>> means, quaternions = torch.tensor([[0.0, 0, 1], [0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]] * 2)
+        >>> splats = splat(means, quaternions, torch.full((2, 3), 0.2), torch.full((2,), 0.5), camera,
+        ...                colors=torch.ones(2, 3))
+        >>> round(first_order_map(splats, Multiplier.dropout(0.5))[0, 8, 8].item(), 3)  # 0.25 (0.25 + 0.25)
+        0.125
     """
     spread = multiplier.variance
     if isinstance(spread, Tensor):

@@ -46,6 +46,19 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None, trus
             depend on the camera, or those of the source are test-time ones already.
         FileExistsError: if the target exists: plain opacities are needed to train on and are never overwritten.
         FileNotFoundError: if there is no source.
+
+    Example:
+        >>> import tempfile
+        >>> import torch
+        >>> from reference_trainer.model.gaussians import Gaussians
+        >>> from reference_trainer.model.ply import load_ply, save_ply
+        >>> gaussians = Gaussians.from_points(torch.rand(5, 3), torch.rand(5, 3), torch.full((5,), 0.1), sh_degree=0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plain, baked = Path(folder, "plain.ply"), Path(folder, "baked.ply")
+        ...     save_ply(gaussians, plain)
+        ...     _ = bake_ply(plain, baked, regularizer="dropout(0.2)")
+        ...     load_ply(baked).opacity_scale
+        0.8
     """
     if target.exists():
         raise FileExistsError(f"{target} exists already: give another --out, or delete it.")

@@ -222,6 +222,12 @@ def cameras_between(
     The path from one to the other is that of `camera_between`; ``past`` is how far beyond either end a camera may
     stand, as a share of it, by default 0.15 short of both. Raises ValueError if the scene has fewer than two training
     cameras.
+
+    Example:
+        >>> from reference_trainer.scenes import synthetic_scene
+        >>> draw = cameras_between(synthetic_scene(width=32, height=24, points=50))
+        >>> draw(torch.Generator().manual_seed(0)).width
+        32
     """
     cameras = [view.camera for view in scene.train]
     if len(cameras) < 2:
