@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ca_reg._accumulate import Deviations, RenderMoments, effect_of, exact_mean, finite_colors, visible_mean
 from ca_reg._check import check_callable, check_count, check_finite, check_opacity, check_opacity_range, check_rate
-from ca_reg._random import seeded
+from ca_reg._random import PortableGenerator
 from ca_reg.functional import Multiplier
 from ca_reg.regularizer import Params, Regularizer
 from ca_reg.regularizers import GaussianDropout
@@ -79,8 +79,8 @@ class CAScore:
         alpha_fn: for renderers without an alpha: ``alpha_fn(opacity, view)`` renders the view with all colors 1 over a
             background of 0, or returns the alpha itself. It is called once per render, doubles the cost, and
             replaces any alpha of ``render_fn``.
-        seed: seed of the masks. They are drawn on the CPU from (seed, view index) alone: the same on every device, and
-            whatever other views there are. More renders extend the same sequence.
+        seed: seed of the masks. They follow from (seed, view index) alone: the same on every device, where they are
+            computed, and whatever other views there are. More renders extend the same sequence.
 
     Raises:
         TypeError: if an argument is of the wrong type.
@@ -316,7 +316,11 @@ class CAScore:
         ``differ`` takes, for every draw but the first, whether it differs from that, as a tensor that is not yet read.
         """
         # One generator per view: more renders extend the sequence, other views do not shift it.
-        generator, flat, first = seeded(self.seed, index), x._replace(opacities=x.opacities.reshape(-1)), None
+        generator, flat, first = (
+            PortableGenerator(self.seed, index),
+            x._replace(opacities=x.opacities.reshape(-1)),
+            None,
+        )
         for _ in range(count):
             drawn, *others = self.regularizer.replay(flat, self.regularizer.draw(flat, generator))
             if any(a is not b for a, b in zip(others, flat[1:], strict=True)):

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from ca_reg._check import check_count
-from ca_reg._random import seeded
+from ca_reg._random import seeded, split_mix
 from ca_reg.chain import WrappedModule
 from ca_reg.types import RenderFn, Rendering, read_rendering
 
@@ -41,7 +41,6 @@ Scope = Literal["main", "all"]
 """Which training renders of an iteration are regularized, see :class:`RasterizerHook`."""
 
 DEFAULT_MODEL = "scene.gaussian_model:GaussianModel"
-_WORD = 2**64 - 1
 _MANY_ZEROS = 1e-3  # share of zero opacities beyond what rounding explains
 _ZEROS_EVERY = 127  # renders after which they are counted; odd, as a script may drop in every second one
 
@@ -257,11 +256,8 @@ class RasterizerHook(Hook):
         if key not in self._generators:
             self._generators[key] = torch.Generator(device), seeded(self._seed, model).initial_seed()
         generator, seed = self._generators[key]
-        # The finalizer of splitmix64 (Steele, Lea and Flood 2014): numpy's seed sequences take twenty times as long.
-        x = (seed + step * 0x9E3779B97F4A7C15) & _WORD
-        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
-            x = ((x ^ x >> shift) * factor) & _WORD
-        return generator.manual_seed((x ^ x >> 31) >> 1)
+        # numpy's seed sequences take twenty times as long.
+        return generator.manual_seed(split_mix(seed, step) >> 1)
 
     def _count_zeros(self, opacities: Tensor) -> None:
         """Count Gaussians that arrive dropped, in the renders 1, 2, 4, 8, ..., every 127th, and the last one.

@@ -114,3 +114,14 @@ def spherical_harmonics(directions: Tensor, degree: int) -> Tensor:
             value = sph_harm_y(band, abs(m), polar, azimuth)
             values.append((value.imag if m < 0 else value.real) * (1 if m == 0 else math.sqrt(2)))
     return torch.from_numpy(np.stack(values, 1))
+
+
+def split_mix(state: int, n: int) -> list[int]:
+    """Return n words of SplitMix64 in the arithmetic of whole numbers."""
+    word, words = 1 << 64, list[int]()
+    for _ in range(n):
+        state = (state + 0x9E3779B97F4A7C15) % word
+        x = (state ^ state >> 30) * 0xBF58476D1CE4E5B9 % word
+        x = (x ^ x >> 27) * 0x94D049BB133111EB % word
+        words.append(x ^ x >> 31)
+    return words

@@ -66,7 +66,7 @@ def test_radii_of_dropped_gaussians_are_zeroed_there(scenes, card):
 
 @pytest.mark.parametrize("kind", ["protocol", "until it is known", "exact", "neutral"])
 def test_scores_are_those_of_the_processor(scenes, kind):
-    """Masks are drawn on the processor, so that a score does not depend on the device."""
+    """Its masks do not depend on the device."""
     found = []
     for scene in scenes:
         score = {

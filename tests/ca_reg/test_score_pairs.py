@@ -10,6 +10,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from oracles import split_mix
 
 from ca_reg import CAScore, Reason
 
@@ -49,9 +50,8 @@ def all_masks(rate, neutral=False, behind=None):
 
 
 def masked_renders(rate, seed, index, count):
-    generator = torch.Generator()
-    generator.manual_seed(int(np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)[0] >> np.uint64(1)))
-    keep = np.stack([(torch.rand(N, generator=generator) >= rate).numpy() for _ in range(count)])
+    words = split_mix(int(np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)[0]), count * N)
+    keep = np.array([(word >> 40) / 2**24 >= rate for word in words]).reshape(count, N)
     return image_and_alpha(OPACITY * keep, BACKGROUND)
 
 
@@ -110,7 +110,7 @@ def score_of(options):
 
 VALUES = {
     "samples": 3, "p": 0.2, "drop_rate": 0.3, "threshold": 0.85, "ddof": 1, "layout": "HWC", "alpha_fn": True,
-    "seed": 9, "index": 4, "exact": True, "neutral": True, "relative_error": 0.15, "max_samples": 24,
+    "seed": 8, "index": 4, "exact": True, "neutral": True, "relative_error": 0.15, "max_samples": 24,
 }  # fmt: skip
 
 # = the protocol in numpy says the same    x refused by name    on the diagonal: the option alone
