@@ -15,28 +15,25 @@ import tyro
 from torch import Tensor
 
 from ca_reg import Params
-from ca_reg.neighbors import _along_an_axis, nearest_neighbors
+from ca_reg.neighbors import _by_leaves, nearest_neighbors
 from ca_reg.regularizers import parse
 
 RULES = ("density", "geometry", "d2gs", "drop_anchors", "clustered(0.5)", "position_noise(0.1)")
 
 
-def costs(counts: Sequence[int] = (10_000, 36_000, 100_000, 300_000), rounds: int = 3, largest: int = 100_000) -> None:
+def costs(counts: Sequence[int] = (10_000, 36_000, 100_000, 300_000), rounds: int = 3) -> None:
     """Print a table.
 
     Args:
         counts: numbers of Gaussians.
         rounds: of which the least is taken.
-        largest: above this number the search without SciPy is left out.
     """
     torch.set_num_threads(1)
     print("| Gaussians | 10 neighbors, SciPy | without | " + " | ".join(f"`{rule}`" for rule in RULES) + " |")
     print("|---:" * (3 + len(RULES)) + "|")
     for count in counts:
         x = Params(torch.full((count,), 0.5), surface(count), view_matrix=torch.eye(4), step=5_000)
-        calls = {"tree": lambda x=x: nearest_neighbors(x.means, 10)}
-        if count <= largest:
-            calls["axis"] = lambda x=x: _along_an_axis(x.means, 10)
+        calls = {"tree": lambda x=x: nearest_neighbors(x.means, 10), "leaves": lambda x=x: _by_leaves(x.means, 10)}
         for rule in RULES:
             calls[rule] = lambda x=x, rule=rule: parse(rule).regularize(x)
             calls[rule + " again"] = again(rule, x)
@@ -46,7 +43,7 @@ def costs(counts: Sequence[int] = (10_000, 36_000, 100_000, 300_000), rounds: in
                 start = time.thread_time()
                 call()
                 times[name] = min(times[name], time.thread_time() - start)
-        cells = [f"{times['tree']:.3f} s", f"{times['axis']:.3f} s" if "axis" in times else "-"]
+        cells = [f"{times['tree']:.3f} s", f"{times['leaves']:.3f} s"]
         cells += [f"{times[rule]:.3f} s; {1e3 * times[rule + ' again']:.1f} ms" for rule in RULES]
         print(f"| {count:,} | " + " | ".join(cells) + " |", flush=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from typing import Any
 
@@ -15,16 +16,15 @@ __all__ = ["nearest_distance", "nearest_neighbors", "rms_neighbor_distance"]
 SMALLEST_SQUARED_DISTANCE = 1e-7  # INRIA's clamp: coinciding points still get a Gaussian of some size
 TREE_FROM = 4_000  # points; below that the other search takes less time than importing SciPy
 CHUNK_ELEMENTS = 4_000_000  # distances held at a time: 16 MB in float32
-CHUNK_ROWS = 256  # sorted points per chunk; larger chunks span a wider strip, smaller ones make too many calls
+LEAF = 64  # points of a box: fewer make more calls, more compare points that are far apart
 
 
 @torch.no_grad()
 def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Find the nearest other points of every point, exactly.
 
-    For many points SciPy's k-d tree finds them in O(N log N), if SciPy is installed
-    (``pip install ca_reg[neighbors]``); otherwise a search along one axis takes nearly O(N^2). The two may break ties
-    differently.
+    Many points on a CPU take SciPy's k-d tree if it is installed (``pip install ca_reg[neighbors]``), which is several
+    times as fast there; all others are compared box by box on their device. The two may break ties differently.
 
     Args:
         points: finite, shape (N, 3), on any device; half precision is searched in float32.
@@ -46,10 +46,10 @@ def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     if points.ndim != 2 or points.shape[1] != 3 or n <= count:
         raise ValueError(f"points must have shape (N, 3) with N > {count}, got {tuple(points.shape)}.")
     points = at_least_single(points)
-    if n >= TREE_FROM:
+    if n >= TREE_FROM and points.device.type == "cpu":
         with suppress(ImportError):
             return _by_tree(points, count)
-    return _along_an_axis(points, count)
+    return _by_leaves(points, count)
 
 
 def _by_tree(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -69,38 +69,63 @@ def _on_cpu(points: Tensor) -> Any:
     return points.detach().cpu().double().numpy()
 
 
-def _along_an_axis(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Find exact neighbors by a sweep along the longest axis.
+def _by_leaves(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Find exact neighbors by comparing small boxes of points with the boxes around them, all on the points' device.
 
-    In the order along that axis, a chunk's neighbors among those nearby bound how far away the true ones can be; only
-    points in the strip of that width are then compared.
+    The neighbors within the own box bound how far away the true ones can be; only boxes that are nearer are searched.
     """
-    n = points.shape[0]
-    axis = int((points.amax(0) - points.amin(0)).argmax())
-    order = points[:, axis].argsort()
-    ordered = points[order]
-    along = ordered[:, axis].contiguous()
-    squares = points.new_empty(n, count)
-    indices = torch.empty(n, count, dtype=torch.int64, device=points.device)
-    rows = max(1, min(CHUNK_ROWS, CHUNK_ELEMENTS // n))
-    for start in range(0, n, rows):
-        stop = min(start + rows, n)
-        near, _ = _search(ordered, start, stop, max(0, start - rows - count), min(n, stop + rows + count), count)
-        reach = near[:, -1].sqrt().amax() * (1 + 1e-5)  # rounded up: single precision must not lose a tie
-        low = int(torch.searchsorted(along, along[start] - reach))
-        high = int(torch.searchsorted(along, along[stop - 1] + reach, right=True))
-        found, places = _search(ordered, start, stop, min(low, start), max(high, stop), count)
-        squares[order[start:stop]], indices[order[start:stop]] = found, order[places]
-    return squares, indices
+    n = len(points)
+    ids, places = _leaves(points, max(LEAF, 4 * count))
+    low, high = places.amin(1), places.amax(1)
+
+    def gaps(rows: Tensor) -> Tensor:
+        """Return the squared distances of these boxes to all, (rows, leaves)."""
+        return torch.maximum(low[rows, None] - high, low - high[rows, None]).clamp_min_(0).square_().sum(-1)
+
+    def search(rows: Tensor, leaves: Tensor) -> tuple[Tensor, Tensor]:
+        """Return squared distances and indices of the nearest points of these leaves, (rows, some), for each row's."""
+        others = ids[leaves].flatten(1)[:, None]
+        # With matrix products, cdist would return 0 for near duplicates.
+        mode = "donot_use_mm_for_euclid_dist"
+        distances = torch.cdist(places[rows], places[leaves].flatten(1, 2), compute_mode=mode)
+        distances.masked_fill_((others == ids[rows][..., None]) | (others >= n), torch.inf)
+        nearest = distances.topk(count, largest=False)
+        return nearest.values.square_(), others.expand_as(distances).gather(2, nearest.indices)
+
+    every = torch.arange(len(ids), device=points.device)
+    pairs = ids.shape[1] ** 2  # of the points of two leaves
+    own = [search(some, some[:, None])[0].amax((1, 2)) for some in torch.split(every, max(1, CHUNK_ELEMENTS // pairs))]
+    reach = torch.cat(own) * (1 + 1e-5)  # rounded up: single precision must not lose a tie
+    within = [
+        (gaps(some) <= reach[some, None]).sum(1) for some in torch.split(every, max(1, CHUNK_ELEMENTS // len(ids)))
+    ]
+    numbers, order = torch.cat(within).sort(descending=True)
+    most = numbers.tolist()  # the one wait for a card
+    squares, indices = points.new_empty(ids.numel(), count), torch.empty_like(ids).view(-1, 1).repeat(1, count)
+    start = 0
+    while start < len(order):
+        # Leaves with about as many boxes to search go together: each as many as the first, which has most.
+        rows = order[start : start + max(1, CHUNK_ELEMENTS // (pairs * most[start]))]
+        squares[ids[rows]], indices[ids[rows]] = search(rows, gaps(rows).topk(most[start], largest=False).indices)
+        start += len(rows)
+    return squares[:n], indices[:n]
 
 
-def _search(ordered: Tensor, start: int, stop: int, low: int, high: int, count: int) -> tuple[Tensor, Tensor]:
-    """Return squared distances and indices of the nearest among rows [low, high) for every row in [start, stop)."""
-    # With matrix products, cdist would return 0 for near duplicates.
-    distances = torch.cdist(ordered[start:stop], ordered[low:high], compute_mode="donot_use_mm_for_euclid_dist")
-    distances.square_().diagonal(start - low).fill_(torch.inf)
-    nearest = distances.topk(count, dim=1, largest=False)
-    return nearest.values, nearest.indices + low
+def _leaves(points: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Halve the points at the middle of their widest axis, and the halves, until none holds more than ``size``.
+
+    Returns the points' indices, (leaves, points of one), and positions. All leaves are equally large: the first points
+    occur a second time to fill them, with indices from the number of points on.
+    """
+    halvings = max(0, math.ceil(math.log2(len(points) / size)))
+    ids = torch.arange(-(-len(points) >> halvings) << halvings, device=points.device)
+    places = points[ids % len(points)]
+    for level in range(halvings):
+        parts = places.view(1 << level, -1, 3)
+        widest = (parts.amax(1) - parts.amin(1)).argmax(1)
+        order = parts.gather(2, widest[:, None, None].expand(-1, parts.shape[1], 1))[..., 0].argsort(1)
+        places, ids = parts.gather(1, order[..., None].expand(-1, -1, 3)), ids.view(order.shape).gather(1, order)
+    return ids.view(1 << halvings, -1), places.view(1 << halvings, -1, 3)
 
 
 @torch.no_grad()

@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from stand_ins.card import counted_synchronizations
 
 from ca_reg import neighbors
 from ca_reg.neighbors import nearest_distance, nearest_neighbors, rms_neighbor_distance
@@ -50,23 +51,24 @@ def _check(found, numbers, points, count):
 @CASES
 def test_by_scipy_equal_to_the_full_matrix(monkeypatch, kind, n, count):
     pytest.importorskip("scipy")
-    monkeypatch.setattr(neighbors, "_along_an_axis", None)
+    monkeypatch.setattr(neighbors, "_by_leaves", None)
     monkeypatch.setattr(neighbors, "TREE_FROM", 0)
     points = _points(kind, n)
     _check(*nearest_neighbors(points, count), points, count)
 
 
-@pytest.mark.parametrize("chunk", [4_000_000, 1800, 1])
+@pytest.mark.parametrize(("chunk", "leaf"), [(4_000_000, 64), (4_000_000, 4), (10_000, 1), (1, 16)])
 @CASES
-def test_without_scipy_equal_to_the_full_matrix(monkeypatch, kind, n, count, chunk):
+def test_without_scipy_equal_to_the_full_matrix(monkeypatch, kind, n, count, chunk, leaf):
     monkeypatch.setattr(neighbors, "TREE_FROM", 0)
     monkeypatch.setitem(sys.modules, "scipy.spatial", None)
-    monkeypatch.setattr(neighbors, "CHUNK_ELEMENTS", chunk)  # the last is one point at a time, as from 2 million on
+    monkeypatch.setattr(neighbors, "CHUNK_ELEMENTS", chunk)
+    monkeypatch.setattr(neighbors, "LEAF", leaf)
     points = _points(kind, n)
     _check(*nearest_neighbors(points, count), points, count)
 
 
-@pytest.mark.parametrize("tree_from", [0, 10**9], ids=["tree", "axis"])
+@pytest.mark.parametrize("tree_from", [0, 10**9], ids=["tree", "leaves"])
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_is_searched_in_single(monkeypatch, dtype, tree_from):
     """Squares beyond the range of half precision in both directions: distances from 1e-4 to 5e4."""
@@ -79,7 +81,9 @@ def test_half_precision_is_searched_in_single(monkeypatch, dtype, tree_from):
 
 def test_on_any_device(device):
     points = _points("clustered", 601)
-    found, numbers = nearest_neighbors(points.to(device), 7)
+    with counted_synchronizations() as waits:
+        found, numbers = nearest_neighbors(points.to(device), 7)
+    assert waits.total() <= 1
     assert found.device.type == numbers.device.type == device.type
     _check(found.cpu(), numbers.cpu(), points, 7)
 
