@@ -166,6 +166,12 @@ def as_schedule(rate: float | Schedule) -> Schedule:
     return rate if callable(rate) else Constant(rate)
 
 
+def _is_captured() -> bool:
+    """Whether what is computed becomes part of a CUDA graph. PyTorch without CUDA has no answer."""
+    initialized: bool = torch.cuda.is_initialized()  # type: ignore[no-untyped-call]
+    return initialized and torch.cuda.is_current_stream_capturing()
+
+
 class Scheduled(nn.Module):
     """A module without parameters whose rate may follow a schedule; it checks the range of the first opacities.
 
@@ -214,11 +220,18 @@ class Scheduled(nn.Module):
         """Return the rate at a step, for a draw ``x.step``, None for the current one; a number, after a range check.
 
         Inside ``torch.compile`` it is that of the last :meth:`set_step`, a scalar tensor, so that one graph serves all.
+
+        Raises a RuntimeError in the capture of a CUDA graph, unless the rate is constant.
         """
         if isinstance(self._schedule, Constant):
             return self._schedule.value  # checked at construction; does not read the step, which would recompile
         if self._rate is not None and torch.compiler.is_compiling():
             return self._rate
+        if _is_captured():
+            raise RuntimeError(
+                f"a CUDA graph would keep {self.rate_name or 'the rate'} of the step at which it is captured, for all "
+                f"replays: {self._schedule} is not constant. Capture with a constant rate, or draw outside the graph."
+            )
         return self._present_rate(step)
 
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
@@ -235,13 +248,14 @@ class Scheduled(nn.Module):
     def _check(self, opacity: Any) -> None:
         """Check shape and dtype, and at the first call the range of the values, which synchronizes a GPU.
 
-        A compiled graph skips the range check: its control flow cannot depend on values.
+        Graphs, compiled or captured, skip the range check: their control flow cannot depend on values.
         """
         check_opacity(opacity)
-        if not torch.compiler.is_compiling() and not self._opacity_seen:
-            # Compensated dropout before this module may have raised opacities above 1.
-            check_opacity_range(opacity, upper=math.inf)
-            self._opacity_seen = True
+        if torch.compiler.is_compiling() or self._opacity_seen or _is_captured():
+            return
+        # Compensated dropout before this module may have raised opacities above 1.
+        check_opacity_range(opacity, upper=math.inf)
+        self._opacity_seen = True
 
     def extra_repr(self) -> str:
         """Return the constructor arguments that are known from attributes of the same names, for ``print``."""

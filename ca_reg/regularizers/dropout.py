@@ -104,8 +104,9 @@ class GaussianDropout(IndependentDropout):
     A draw comes from the global random state, or from a generator given to the call. Under ``torch.vmap`` draw the
     masks outside, and map :func:`~ca_reg.functional.apply_dropout` over them. Inside ``torch.compile`` one graph serves
     all steps, even with ``fullgraph=True``, and the next all numbers of Gaussians; the values of the opacities are then
-    not checked, and a schedule draws even where its rate is 0. Inside ``torch.utils.checkpoint`` draw without
-    ``generator``, or draw outside and pass ``drawn``. The same holds for :class:`OpacityNoise`.
+    not checked, and a schedule draws even where its rate is 0. A CUDA graph draws anew at every replay; it refuses a
+    schedule, whose rate it would keep. Inside ``torch.utils.checkpoint`` draw without ``generator``, or draw outside
+    and pass ``drawn``. The same holds for :class:`OpacityNoise`.
 
     Convention: opacities are activated, in [0, 1], (N,) or (N, 1). The first call rejects negative ones as logits.
 

@@ -6,11 +6,15 @@ import pickle
 
 import pytest
 import torch
+from stand_ins.card import counted_synchronizations
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 from torch.utils.checkpoint import checkpoint
 
 from ca_reg import CAPenalty, Chain, GaussianDropout, OpacityNoise
 from ca_reg.functional import Multiplier
+from ca_reg.regularizers import parse
 from ca_reg.schedules import LinearRamp
 
 OPACITY = torch.linspace(0.05, 0.95, 40)
@@ -197,6 +201,73 @@ def test_a_compiled_schedule_drops_at_its_rate():
             raise
         # 5 standard deviations of a mean of 40,000 Bernoulli numbers: false alarm 6e-7 each.
         assert abs(dropped - rate) < 5 * 0.5 / 200
+
+
+# --- CUDA graphs ---
+
+GRAPHED = pytest.mark.parametrize(
+    "text", ["dropout(0.3)", "dropout(0.3, compensate=True)", "dropout(0.3) + noise(0.8)"]
+)
+
+
+@pytest.fixture
+def capture(monkeypatch):
+    for asked in ("is_initialized", "is_current_stream_capturing"):
+        monkeypatch.setattr(torch.cuda, asked, lambda: True)
+
+
+class OnTheProcessor(TorchDispatchMode):
+    """Keeps the operations with a tensor of the processor, which a capture refuses."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+
+    def __torch_dispatch__(self, operation, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        devices = [x.device for x in tree_leaves((args, kwargs)) if isinstance(x, torch.Tensor)]
+        if torch.device("cpu") in [*devices, kwargs.get("device")]:
+            self.found.append(operation)
+        return operation(*args, **kwargs)
+
+
+@GRAPHED
+def test_a_capture_neither_waits_for_the_card_nor_copies_to_it(card, capture, text):
+    """Not even in the first call."""
+    opacity = OPACITY.to(card).requires_grad_()
+    with counted_synchronizations() as waits, OnTheProcessor() as operations:
+        parse(text)(opacity)
+    assert not waits
+    assert not operations.found
+
+
+def test_a_graph_that_would_keep_the_rate_of_its_capture_is_refused(capture):
+    module = GaussianDropout(RAMP)
+    module.set_step(50)
+    with pytest.raises(RuntimeError, match=r"keep p of the step at which it is captured.*LinearRamp.*constant rate"):
+        module(OPACITY)
+
+
+@pytest.mark.gpu
+@GRAPHED
+def test_a_cuda_graph_draws_anew_at_every_replay(text):
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    module, opacity = parse(text), torch.full((10_000, 1), 0.5, device="cuda", requires_grad=True)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        drawn = module(opacity)
+        (gradient,) = torch.autograd.grad(drawn.sum(), opacity)
+    keep, replays = module.keep, []
+    for _ in range(2):
+        graph.replay()
+        replays.append([x.clone() for x in (drawn.detach(), gradient, keep)])
+    assert not torch.equal(replays[0][0], replays[1][0])
+    for values, slopes, kept in replays:
+        assert not values[~kept].any()
+        assert not slopes[~kept].any()
+        # 5 standard deviations of a mean of 10,000 Bernoulli numbers: false alarm 6e-7 each.
+        assert abs(kept.float().mean().item() - 0.7) < 5 * 0.5 / 100
 
 
 # --- recomputation ---
