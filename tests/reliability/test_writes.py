@@ -56,6 +56,7 @@ def test_a_log_is_the_old_one_or_the_shortened_wherever_that_is_killed(tmp_path,
     assert seen == ["".join(lines)] * 4 + ["".join(lines[:2])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("power", "after"), [(False, "the new one"), (True, "the n")])
 def test_a_careless_writer_is_found_out(tmp_path, power, after):
     """In place, a kill leaves a part; moved without being synced, a power cut does."""

@@ -87,6 +87,7 @@ def test_the_engine_is_chosen_said_and_noted(engine, trained, capsys, tmp_path, 
     assert (noted == "torch") == (engine == "torch")
 
 
+@pytest.mark.slow
 def test_a_run_from_training_to_pictures(trained, capsys, tmp_path):
     assert (trained / "results.json").exists()
     results = json.loads((trained / "results.json").read_text())

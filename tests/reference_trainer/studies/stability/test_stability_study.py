@@ -12,7 +12,7 @@ from reference_trainer.studies.stability.cases import Case, Probe, all_cases, de
 from reference_trainer.studies.stability.quantities import base_scene, splats_of
 from reference_trainer.studies.stability.stability_study import judge, judge_with, stability_study, study_stability
 
-SLOW = {"Gaussians on one pixel", "renders K", "4096", "beyond any scene", "HDR"}
+SLOW = {"Gaussians on one pixel", "renders K", "4096", "beyond any scene", "HDR", "(torch)"}
 
 
 def marked(name):
