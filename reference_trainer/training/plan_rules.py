@@ -14,6 +14,7 @@ from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.assembly import make_density, make_losses, make_regularizer
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.losses import Photometric
+from reference_trainer.training.losses.penalties import Alpha
 from reference_trainer.training.model_state import initial_gaussians, seen_by_any
 
 __all__ = ["DROPOUT_GAINS", "FAR_APART_GAINS", "RULES", "PlanItem"]
@@ -63,6 +64,8 @@ def alpha_masks(scene: Scene, config: TrainConfig) -> PlanItem:
     masks = [view.alpha for view in scene.train if view.alpha is not None]
     if not masks:
         return PlanItem("alpha masks", "left out", "by construction: no training picture has one")
+    if any(isinstance(term, Alpha) and term.dark is None for term in make_losses(config)):
+        return PlanItem("alpha masks", "used", "asked for: Alpha compares with them")
     empty = sum(float((alpha == 0).float().mean()) for alpha in masks) / len(masks)
     reason = f"by construction: the pictures, {empty:.0%} of them empty, lie on the background already"
     return PlanItem("alpha masks", "left out", reason)
@@ -70,16 +73,23 @@ def alpha_masks(scene: Scene, config: TrainConfig) -> PlanItem:
 
 def background(scene: Scene, config: TrainConfig) -> PlanItem:
     """The background is added behind the Gaussians, whatever its color: it costs next to nothing."""
+    if config.random_background:
+        return PlanItem("background", "used", "asked for (random_background): a color drawn anew at each step")
     color = ", ".join(f"{value:g}" for value in scene.background.tolist())
     return PlanItem("background", "used", f"({color}) behind everything; adding it takes less than 1% of a step")
 
 
 def depth_output(scene: Scene, config: TrainConfig) -> PlanItem:
     """Depth is drawn only if a term of the loss needs it."""
-    asking = dict.fromkeys(type(term).__name__ for term in make_losses(config) if "depth" in term.needs)
+    asking = _terms_that_need("depth", config)
     if asking:
-        return PlanItem("depth output", "used", f"asked for: {', '.join(asking)} looks at it")
+        return PlanItem("depth output", "used", f"asked for: {asking} looks at it")
     return PlanItem("depth output", "left out", "by construction: no term of the loss looks at depth")
+
+
+def _terms_that_need(what: str, config: TrainConfig) -> str:
+    """Return the names of the terms of the loss that need something of the renderer, empty if none does."""
+    return ", ".join(dict.fromkeys(type(term).__name__ for term in make_losses(config) if what in term.needs))
 
 
 def distortion(scene: Scene, config: TrainConfig) -> PlanItem:
@@ -204,6 +214,9 @@ def moments(scene: Scene, config: TrainConfig) -> PlanItem:
     """Exact mean and variance over masks."""
     if config.analytic:
         return PlanItem("moments", "used", "asked for (analytic): every step trains on the expectation")
+    asking = _terms_that_need("moments", config)
+    if asking:
+        return PlanItem("moments", "used", f"asked for: {asking} renders them")
     return PlanItem("moments", "left out", "by construction: a step needs none; the monitor measures at its own steps")
 
 

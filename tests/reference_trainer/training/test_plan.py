@@ -180,6 +180,24 @@ def test_a_step_renders_no_depth_and_no_dropped_gaussian(tiny_scene, monkeypatch
         assert len(rendering.splats.projection.means) == len(rendering.splats.indices)
 
 
+@pytest.mark.parametrize(
+    ("name", "config", "said"),
+    [
+        ("moments", TrainConfig(loss="photometric + co_adaptation(3.0)"), r"asked for: CoAdaptation"),
+        ("moments", TrainConfig(loss="photometric + consistency(0.3, exact=True)"), r"asked for: Consistency"),
+        ("moments", TrainConfig(analytic=True, dropout=0.2), r"asked for \(analytic\)"),
+        ("alpha masks", TrainConfig(loss="photometric + alpha(1.0)"), r"asked for: Alpha compares with them"),
+        ("background", TrainConfig(random_background=True), r"asked for \(random_background\): .*anew at each step"),
+    ],
+)
+def test_what_a_training_uses_is_not_said_to_be_left_out(tiny_scene, name, config, said):
+    masked = tuple(dataclasses.replace(view, alpha=torch.ones_like(view.image[0])) for view in tiny_scene.train)
+    scene = dataclasses.replace(tiny_scene, train=masked) if name == "alpha masks" else tiny_scene
+    item = items(scene, config)[name]
+    assert (item.decision, item.changes) == ("used", {})
+    assert re.search(said, item.reason)
+
+
 def test_a_step_computes_no_moments_unless_it_trains_on_them(tiny_scene, monkeypatch):
     calls = []
     original = step_module.render_moments_of
