@@ -101,21 +101,22 @@ def distortion(scene: Scene, config: TrainConfig) -> PlanItem:
 def densification(scene: Scene, config: TrainConfig) -> PlanItem:
     """Clones and splits."""
     name, points = "densification", scene.points
-    until = config.densify_end
-    if config.densify_every == 0:
+    until, every = config.densify_end, config.densify_every
+    if every == 0:
         return PlanItem(name, "left out", "asked for (densify_every=0)")
-    if until <= config.densify_from:
-        return PlanItem(name, "left out", f"by construction: it would begin at step {config.densify_from} of {until}")
+    first = (config.densify_from // every + 1) * every  # the schedule counts from step 0
+    if first >= until:
+        return PlanItem(name, "left out", f"by construction: the first would be at step {first} of {until}")
     pixels = sum(view.camera.width * view.camera.height for view in scene.train) / len(scene.train)
     reason = f"{len(points.positions)} initial points are {len(points.positions) / pixels:.2f} per pixel of a view"
-    reason += f"; detail comes from clones and splits, from step {config.densify_from} of {config.iterations} on"
+    reason += f"; detail comes from clones and splits, from step {first} of {config.iterations} on"
     return PlanItem(name, "used", reason)
 
 
 def opacity_reset(scene: Scene, config: TrainConfig) -> PlanItem:
     """Lowering all opacities."""
     name, first = "opacity reset", config.opacity_reset_from
-    if config.opacity_reset_over_white and scene.is_white:
+    if config.opacity_reset_over_white and scene.is_white and config.densify_from > 0:
         first = min(first, config.densify_from)
     until = config.densify_end
     if not make_density(config).resets:

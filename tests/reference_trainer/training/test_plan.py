@@ -105,7 +105,7 @@ def test_points_behind_all_cameras_are_left_out(tiny_scene):
     ("name", "config", "said"),
     [
         ("densification", TrainConfig(densify_every=0), r"asked for"),
-        ("densification", TrainConfig(iterations=400), r"begin at step 500 of 400"),
+        ("densification", TrainConfig(iterations=400), r"first would be at step 600 of 400"),
         ("opacity reset", TrainConfig(iterations=2_000), r"first would be at step 2001 of 2000"),
         ("opacity reset", TrainConfig(opacity_reset_every=0), r"asked for"),
         ("dropped Gaussians", TrainConfig(dropout=0.2), r"neither projected nor sorted"),
@@ -196,6 +196,28 @@ def test_what_a_training_uses_is_not_said_to_be_left_out(tiny_scene, name, confi
     item = items(scene, config)[name]
     assert (item.decision, item.changes) == ("used", {})
     assert re.search(said, item.reason)
+
+
+@pytest.mark.parametrize("iterations", [500, 501, 600, 601, 650])
+@pytest.mark.parametrize(("start", "every"), [(500, 100), (499, 100), (550, 300), (0, 7)])
+def test_growth_is_planned_where_the_schedule_densifies(tiny_scene, iterations, start, every):
+    """Held against the steps at which density control acts."""
+    config = TrainConfig(iterations=iterations, densify_from=start, densify_every=every)
+    density = Trainer(tiny_scene, config).density
+    due = [step for step in range(iterations) if density.is_due(step)]
+    item = items(tiny_scene, config)["densification"]
+    assert item.decision == ("used" if due else "left out")
+    if due:
+        assert f"from step {due[0]} of {iterations} on" in item.reason
+
+
+def test_a_reset_over_white_that_never_comes_is_not_planned(tiny_scene):
+    """Not at a densification that begins with the first step."""
+    white = dataclasses.replace(tiny_scene, background=torch.ones(3))
+    config = TrainConfig(iterations=2_500, opacity_reset_over_white=True, densify_from=0)
+    assert "first at step 2001 of 2500" in items(white, config)["opacity reset"].reason
+    later = dataclasses.replace(config, densify_from=300)
+    assert "first at step 300 of 2500" in items(white, later)["opacity reset"].reason
 
 
 def test_a_step_computes_no_moments_unless_it_trains_on_them(tiny_scene, monkeypatch):
