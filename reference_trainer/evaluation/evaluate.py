@@ -18,7 +18,15 @@ from ca_reg import CAResult, CAScore, attribute
 from ca_reg.error_maps import ErrorMap
 from reference_trainer.evaluation.error_maps import ErrorMaps, error_map
 from reference_trainer.evaluation.lpips import LPIPS
-from reference_trainer.evaluation.metrics import DepthErrors, color_variance_map, depth_errors, on_white, psnr, ssim
+from reference_trainer.evaluation.metrics import (
+    DepthErrors,
+    color_variance_map,
+    counted,
+    depth_errors,
+    on_white,
+    psnr,
+    ssim,
+)
 from reference_trainer.evaluation.pictures import PANEL, file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.results import ResultStore, machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
@@ -128,7 +136,7 @@ def evaluate(
     """Measure a model at views, with their photographs or without.
 
     Images are compared as floats clamped to [0, 1], not rounded to 8 bits. If a view has a mask, PSNR counts the pixels
-    inside it, and SSIM and LPIPS see white outside (the DTU protocol).
+    inside it, and SSIM and LPIPS see white outside (the DTU protocol); a mask that leaves no pixel leaves no quality.
 
     Args:
         model: what to measure.
@@ -198,7 +206,7 @@ def _measure(
     quality, depth = (math.nan,) * 3, DepthErrors()
     if truth is not None and out.depth is not None:
         depth = depth_errors(out.depth / out.alpha.clamp_min(1e-6), truth)
-    if isinstance(view, View):
+    if isinstance(view, View) and counted(view.image, view.mask).numel():
         pair = on_white(image, view.mask), on_white(view.image, view.mask)
         quality = psnr(image, view.image, view.mask), ssim(*pair), math.nan if perceptual is None else perceptual(*pair)
     found: dict[Any, CAResult] = {}
@@ -232,8 +240,8 @@ def _measure(
         bar, found = ("0", f"{ERROR_PICTURE_RANGE:g}"), {"exact CA": exact_half}
         guessed = {}
         if expected is not None:
-            guessed = {f"expected error {expected.psnr:.1f} dB": (expected_error_picture(expected), bar)}
-        title = "render" if photograph is None else f"render {measured.psnr:.2f} dB"
+            guessed = {_titled("expected error", expected.psnr, "{:.1f} dB"): (expected_error_picture(expected), bar)}
+        title = _titled("render", measured.psnr, "{:.2f} dB")
         panels: dict[str, tuple[Tensor, tuple[str, str] | None]] = {title: (image, None)}
         if photograph is None:
             if scores[2].settings != scores[3].settings:
@@ -270,10 +278,15 @@ def _at(result: CAResult) -> str:
     return "" if result.drop_rate == 0.5 or result.drop_rate is None else f" at drop rate {result.drop_rate:g}"
 
 
+def _titled(name: str, value: float, form: str) -> str:
+    """Return the title of a picture with its value, if it has one."""
+    return name if math.isnan(value) else f"{name} {form.format(value)}"
+
+
 def _maps(results: Mapping[str, CAResult]) -> dict[str, tuple[Tensor, tuple[str, str] | None]]:
     """Return the maps of scores with the ends of their color bars, titled with name and value."""
     ends = "0", f"{CA_PICTURE_RANGE:g}"
-    return {f"{name} {result.value * 1e3:.2f}e-3": (ca_picture(result), ends) for name, result in results.items()}
+    return {_titled(name, of.value * 1e3, "{:.2f}e-3"): (ca_picture(of), ends) for name, of in results.items()}
 
 
 def ca_picture(result: CAResult) -> Tensor:

@@ -11,10 +11,11 @@ from ca_reg import CAScore
 from ca_reg.functional import Multiplier, opacity_noise
 from reference_trainer.evaluation.evaluate import Evaluation, ViewScores, evaluate
 from reference_trainer.evaluation.metrics import DepthErrors, psnr, ssim
-from reference_trainer.evaluation.pictures import file_names
+from reference_trainer.evaluation.pictures import file_names, side_by_side
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.render import render
+from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.images import read_image
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 
@@ -94,6 +95,17 @@ def test_outside_of_its_mask_a_view_does_not_count(tiny_scene, gaussians):
     white = [torch.where(mask == 1, x, 1.0) for x in (image, view.image)]
     assert found.ssim == other.ssim == pytest.approx(ssim(*white))
     assert found.lpips == other.lpips == pytest.approx(metric(*white), abs=1e-6)  # means of float32 numbers
+
+
+def test_a_mask_that_leaves_nothing_leaves_no_quality(tiny_scene, gaussians):
+    """Two white pictures are alike: a view that shows nothing of the object would raise the means."""
+    view, model = tiny_scene.test[0], TrainedModel(gaussians, tiny_scene.background)
+    hidden = dataclasses.replace(view, name="hidden", mask=torch.zeros_like(view.image[0]))
+    both = evaluate(model, {"test": [view, hidden]}, perceptual=Brightness())
+    alone = evaluate(model, {"test": [view]}, perceptual=Brightness())
+    assert all(math.isnan(getattr(both.views[1], name)) for name in ("psnr", "ssim", "lpips", "psnr_expected"))
+    assert all(both.mean("test", name) == alone.mean("test", name) for name in ("psnr", "ssim", "lpips"))
+    assert both.views[1].ca == pytest.approx(both.views[0].ca, rel=0.5)  # needs no photograph
 
 
 def test_images_are_scaled_for_the_test_and_co_adaptation_is_not(tiny_scene, gaussians):
@@ -334,6 +346,18 @@ def test_a_camera_that_sees_nothing_has_a_reason(tiny_scene, gaussians):
     assert all(math.isnan(x) for x in (view.ca, view.ca_exact, view.ca_neutral, view.cv))
     assert (view.visible, view.covered) == (0, 0)
     assert view.ca_reason == "EMPTY"
+
+
+def test_a_panel_has_no_value_in_its_titles_where_there_is_none(gaussians, tmp_path):
+    """Of a score where no pixel is covered, and of a photograph of which no pixel counts."""
+    scene = synthetic_scene(width=200, height=16, points=9)  # wider than any title
+    view = dataclasses.replace(scene.test[0], mask=torch.zeros(16, 200))
+    evaluate(TrainedModel(gaussians[:1], scene.background), {"test": [view]}, pictures=tmp_path)
+    panel = read_image(tmp_path / "test" / f"{file_names([view.name])[0]}_panel.png")[0]
+    titles = ["photograph", "render", "error", "expected error", "exact CA"]
+    titled = side_by_side([torch.zeros(3, 16, 200)] * len(titles), titles)
+    assert panel.shape[2] == titled.shape[2]
+    assert torch.equal(panel[:, :20], titled[:, :20])
 
 
 def test_the_pictures_of_a_viewpoint(tiny_scene, gaussians, tmp_path):
