@@ -79,6 +79,19 @@ def test_the_algorithms_of_cuda(monkeypatch):
     assert torch.utils.deterministic.fill_uninitialized_memory
 
 
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_warnings_in_the_place_of_errors_are_as_before(monkeypatch, device):
+    monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    try:
+        with deterministic(device):
+            assert torch.is_deterministic_algorithms_warn_only_enabled() == (device == "cpu")
+        assert torch.are_deterministic_algorithms_enabled()
+        assert torch.is_deterministic_algorithms_warn_only_enabled()
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
 def test_the_option_of_the_command(monkeypatch, tmp_path):
     seen = []
 
