@@ -88,7 +88,7 @@ def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
     options, config = read_run_settings(run / "config.json")
     others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(scene.name, ())]
     splits: dict[str, Sequence[View]] = dict(zip(_SPLITS, (others, scene.test, scene.train), strict=True))
-    known: dict[bytes, tuple[Tensor, Tensor, Tensor, float]] = {}
+    known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, float]] = {}
     rows, of_kept = [], dict[bytes, dict[str, dict[str, float]]]()
     for name in rules:
         start = time.process_time()
@@ -118,7 +118,7 @@ def quality(model: TrainedModel, view: View) -> float:
 def keeps(
     model: TrainedModel,
     scene: Scene,
-    known: dict[bytes, tuple[Tensor, Tensor, Tensor, float]],
+    known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, float]],
     *,
     ratio: float = 2.0,
     alone: float = 0.0,
@@ -140,19 +140,19 @@ def keeps(
         key = bytes(keep.tolist()) + bytes([fewer])
         if key not in known:
             rest = replace(model, gaussians=model.gaussians[keep])
-            shares, score = unseen_shares(rest, views)
+            shares, where_highest, score = unseen_shares(rest, views)
             plain = rest.without_camera
             weights = [blend_weights(plain, of) / len(of) for of in (views, scene.train)]
-            known[key] = shares, weights[0], weights[1], score
-        shares, there, here, score = known[key]
+            known[key] = shares, where_highest, weights[0], weights[1], score
+        shares, where_highest, there, here, score = known[key]
         scores.append(score)
-        hang = hanging(shares.mean(0), there, here, ratio=ratio, together=together, alone=alone)
+        hang = hanging(shares, there, here, ratio=ratio, together=together, alone=alone)
         if most is not None:
-            held = torch.where(hang, shares.mean(0), 0.0)
+            held = torch.where(hang, shares, 0.0)
             hang &= held >= held.sort(descending=True).values[min(most, len(held)) - 1]
         if number == rounds or not bool(hang.any()):
             break
-        where.update(views[i].name for i in shares[:, hang].argmax(0).tolist())
+        where.update(views[i].name for i in where_highest[hang].tolist())
         keep[keep.clone()] = ~hang
     return keep, scores, dict(where)
 

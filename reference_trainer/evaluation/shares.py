@@ -116,26 +116,38 @@ def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None =
     where, scores = Counter[str](), list[float]()
     for number in range(rounds + 1):
         rest = replace(model, gaussians=model.gaussians[keep])
-        shares, score = unseen_shares(rest, views)
+        shares, where_highest, score = unseen_shares(rest, views)
         scores.append(score)
         if number == rounds:
             break
         plain = rest.without_camera
         weights = (blend_weights(plain, of) / len(of) for of in (views, here))
-        hang = hanging(shares.mean(0), *weights)
+        hang = hanging(shares, *weights)
         if not bool(hang.any()):
             break
-        where.update(views[i].name for i in shares[:, hang].argmax(0).tolist())
+        where.update(views[i].name for i in where_highest[hang].tolist())
         keep[keep.clone()] = ~hang
     return Guard(keep, where, tuple(scores))
 
 
-def unseen_shares(model: TrainedModel, views: Sequence[Viewpoint]) -> tuple[Tensor, float]:
-    """Return the shares of every view, (V, N), 0 where it has no score, and the mean of the scores there are."""
+def unseen_shares(model: TrainedModel, views: Sequence[Viewpoint]) -> tuple[Tensor, Tensor, float]:
+    """Return the mean share of every Gaussian, the position of the view where it is highest, and the mean score.
+
+    Shares (N,), float64, are 0 at a view without a score, which the mean score leaves out; positions (N,) are 0 for a
+    Gaussian without a share.
+    """
     score, opacities = model.exact_ca_score(drop_rate=model.dropout or 0.2), model.gaussians.opacities
-    found = [attribute(score, model.shares, opacities, view) for view in views]
-    values = [result.value for _, result in found if result.reason is Reason.OK]
-    return torch.stack([shares for shares, _ in found]), sum(values) / max(1, len(values))
+    total = torch.zeros_like(opacities, dtype=torch.float64)
+    highest, where, values = torch.zeros_like(total), torch.zeros_like(total, dtype=torch.int64), list[float]()
+    # Added up: of a hundred photographs, the shares of all views would take gigabytes.
+    for number, view in enumerate(views):
+        shares, result = attribute(score, model.shares, opacities, view)
+        total += shares
+        where.masked_fill_(shares > highest, number)
+        highest = torch.maximum(highest, shares)
+        if result.reason is Reason.OK:
+            values.append(result.value)
+    return total / len(views), where, sum(values) / max(1, len(values))
 
 
 def blend_weights(model: TrainedModel, views: Sequence[Viewpoint]) -> Tensor:

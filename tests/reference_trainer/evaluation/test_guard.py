@@ -1,18 +1,21 @@
 """The guard, on the built-in scene with a veil planted where no training camera looks."""
 
 import math
+import weakref
 from dataclasses import replace
 
 import pytest
 import torch
 
+from ca_reg import attribute
+from reference_trainer.evaluation import shares as shares_module
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.shares import guard, unseen_shares
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes import synthetic_scene
-from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.scene import Scene, Viewpoint
 from reference_trainer.scenes.virtual_cameras import unseen_views
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.model_state import initial_gaussians, seen_by_any
@@ -107,12 +110,32 @@ def test_one_camera_has_nothing_between(scene):
 
 def test_shares_at_unseen_views_add_up_to_their_scores(scene):
     model, views = planted_model(scene), unseen_views(scene)[::9]
-    shares, score = unseen_shares(model, views)
-    exact = model.exact_ca_score(drop_rate=0.2)
-    scores = [exact(model.gaussians.opacities, view).value for view in views]
-    assert shares.shape == (3, len(model.gaussians))
-    torch.testing.assert_close(shares.sum(1), torch.tensor(scores, dtype=torch.float64), rtol=1e-3, atol=1e-9)
+    away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ views[0].camera.world_to_camera  # which sees nothing
+    views.insert(1, Viewpoint("away", replace(views[0].camera, world_to_camera=away)))
+    shares, where, score = unseen_shares(model, views)
+    exact, opacities = model.exact_ca_score(drop_rate=0.2), model.gaussians.opacities
+    of_views = torch.stack([attribute(exact, model.shares, opacities, view).shares for view in views])
+    scores = [exact(opacities, view).value for view in views if view.name != "away"]
     assert score == pytest.approx(sum(scores) / 3)
+    assert shares.sum().item() == pytest.approx(sum(scores) / 4, rel=1e-3)
+    torch.testing.assert_close(shares, of_views.mean(0))
+    assert torch.equal(of_views.gather(0, where[None])[0], of_views.amax(0))
+    assert len(where[shares > 0].unique()) > 1
+
+
+def test_the_shares_of_all_views_are_never_held_at_once(scene, monkeypatch):
+    """Of a hundred photographs there would be gigabytes."""
+    made = []
+
+    def watched(*args):
+        found = attribute(*args)
+        made.append(weakref.ref(found.shares))
+        assert sum(share() is not None for share in made) <= 2
+        return found
+
+    monkeypatch.setattr(shares_module, "attribute", watched)
+    guard(planted_model(scene), scene, rounds=1)
+    assert len(made) >= 2 * len(unseen_views(scene))
 
 
 @pytest.mark.slow
