@@ -106,8 +106,9 @@ def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
         row: dict[str, object] = {"strategy": strategy, "seeds": len(of)}
         for title, (split, name) in columns.items():
             values = [run["mean"].get(split, {}).get(name) for run in of]
-            if known := [value for value in values if value is not None]:
-                row[title] = format_mean_std(known, unit=_unit(name), decimals=_SHOWN[name][1])
+            if any(value is not None for value in values):
+                found = [math.nan if value is None else value for value in values]  # JSON has no nan
+                row[title] = format_mean_std(found, unit=_unit(name), decimals=_SHOWN[name][1])
         for name in ("gaussians", "seconds"):
             row[_SHOWN[name][0]] = format_mean_std([run[name] for run in of], decimals=0)
         rows.append(row)

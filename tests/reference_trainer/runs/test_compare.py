@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import math
 import os
 import shlex
 import shutil
@@ -16,6 +17,7 @@ from ca_reg.monitor import LOG_NAME
 from reference_trainer.cli.options import RenderOptions
 from reference_trainer.cli.training import Demo
 from reference_trainer.evaluation.pictures import save_png
+from reference_trainer.evaluation.results import write_json
 from reference_trainer.evaluation.tables import comparison_table, summary
 from reference_trainer.render import chosen_engine
 from reference_trainer.runs import compare as compare_module
@@ -72,6 +74,14 @@ def test_the_table_has_mean_and_sample_deviation():
 def test_a_quality_that_one_strategy_lacks():
     first, second = cells(comparison_table({"a": [made(None)], "b": [made(20.0)]}))
     assert (first["test PSNR"], second["test PSNR"]) == ("n/a", "20.00")
+
+
+def test_the_table_says_how_many_seeds_have_a_score(tmp_path):
+    """Also where a file has null in its place, which is how JSON says nan."""
+    write_json(tmp_path / "results.json", made(math.nan))
+    unknown = json.loads((tmp_path / "results.json").read_text())
+    (row,) = cells(comparison_table({"a": [made(18.0), unknown, made(20.0)]}))
+    assert (row["seeds"], row["test PSNR"]) == ("3", "19.00 ± 1.41 (2 of 3)")
 
 
 def test_strategies_change_the_regularizers_only():
