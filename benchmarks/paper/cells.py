@@ -240,7 +240,7 @@ def renders(model: TrainedModel, view: View, seed: int, draws: int = 5) -> dict[
     "one" is the mean PSNR of renders under one draw each, "five" the PSNR of the mean of these renders, "mean" that of
     the exact mean, "scaled" that of a render with the mean opacities, which after dropout is the test-time render.
     """
-    x = model.gaussians.params(view.camera, step=model.step)
+    x = model.params(view.camera)
     generator = torch.Generator(x.opacities.device).manual_seed(seed)
     drawn = torch.stack([model.chain.regularize(x, generator).opacities for _ in range(draws)])
     images = MaskedRenders(model).render_batch(drawn, view)[0]

@@ -13,6 +13,7 @@ from ca_reg import CAScore, Chain, GaussianDropout, Params
 from ca_reg.functional import Multiplier
 from ca_reg.regularizers import parse
 from ca_reg.types import MomentsFn, RenderFn
+from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import arguments, render_gaussians
 from reference_trainer.render import (
@@ -38,7 +39,7 @@ class TrainedModel:
         background: color behind them, shape (3,).
         regularizer: what it was trained with, an expression for `ca_reg.regularizers.parse`; it decides the test-time
             opacities and the drop rate of the paper's CA protocol.
-        step: of the training, for schedules.
+        step: number of training steps; schedules stand where the last of them used them.
         sh_degree: highest band of spherical harmonics to use; None for all.
         for_rendering: whether the opacities are the test-time ones already and the plain ones are unknown.
     """
@@ -57,8 +58,9 @@ class TrainedModel:
 
     @property
     def dropout(self) -> float:
-        """The rate of all uniform, uncompensated dropout combined, at ``step``; 0 without any."""
-        rates = [m.rates(self._plain) for m in self.chain if isinstance(m, GaussianDropout) and not m.compensate]
+        """The rate of all uniform, uncompensated dropout combined, in the last step; 0 without any."""
+        plain = self.params()
+        rates = [m.rates(plain) for m in self.chain if isinstance(m, GaussianDropout) and not m.compensate]
         return 1.0 - math.prod(1.0 - float(rate) for rate in rates)
 
     @property
@@ -80,18 +82,19 @@ class TrainedModel:
     @property
     def test_opacities(self) -> Tensor:
         """The test-time opacities, shape (N,); only for models where they do not depend on the camera."""
-        return self._tested(self._plain).opacities
+        return self._tested(self.params()).opacities
 
-    @property
-    def _plain(self) -> Params:
-        return self.gaussians.params(step=self.step)
+    def params(self, camera: Camera | None = None) -> Params:
+        """Return the activated parameters, with the number of the last step: what its regularizers worked on."""
+        # Steps count from 0. At their number a schedule may have ended, such as one that stops with the training.
+        return self.gaussians.params(camera, step=max(self.step - 1, 0))
 
     def _tested(self, x: Params) -> Params:
         return x if self.for_rendering else self.chain.expected(x)
 
     def test_rendering(self, view: Viewpoint, *, depth: bool = False) -> Rendering:
         """Render a view with the test-time opacities; CA is measured on the plain ones instead, see `render`."""
-        tested = self._tested(self.gaussians.params(view.camera, step=self.step))
+        tested = self._tested(self.params(view.camera))
         return render_gaussians(tested, view.camera, self.background, sh_degree=self.sh_degree, depth=depth)
 
     def render(self, opacities: Tensor, view: Viewpoint) -> tuple[Tensor, Tensor]:

@@ -10,8 +10,11 @@ from ca_reg import CAScore, GaussianDropout, OpacityNoise, Reason, attribute
 from ca_reg.functional import Multiplier
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
 from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.runs.run import model_of
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.scene import Scene
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +101,7 @@ def test_test_time_opacities(model):
     assert torch.equal(replace(model, regularizer="").test_opacities, opacities)
     assert torch.equal(model.test_opacities, opacities * 0.8)
     assert torch.equal(
-        replace(model, regularizer="dropout(ramp(0.0, 0.4, 0, 10))", step=5).test_opacities, opacities * 0.8
+        replace(model, regularizer="dropout(ramp(0.0, 0.4, 0, 10))", step=6).test_opacities, opacities * 0.8
     )
     assert torch.equal(replace(model, regularizer="dropout(0.2, compensate=True)").test_opacities, opacities)
     both = replace(model, regularizer="dropout(0.2) + noise(0.6, clip=True, scale=True)")
@@ -110,3 +113,21 @@ def test_test_time_opacities(model):
         0.8,
     )
     assert both.ca_score().settings == model.ca_score().settings
+
+
+@pytest.mark.parametrize(
+    ("schedule", "last"),
+    [
+        ("between(0.4, 0, 8)", 0.4),
+        ("decay(0.6, 0.3, 0, 8)", 0.6 * 0.5 ** (7 / 8)),
+        ("ramp(0.0, 0.4, 0, 8)", 0.35),
+        ("between(0.4, 0, 7)", 0.0),
+    ],
+)
+def test_a_model_is_rendered_with_the_rate_of_its_last_step(scene, schedule, last):
+    """Also where a schedule stops with the training: of steps 0 to 7 the last drew with that rate."""
+    trainer = Trainer(scene, TrainConfig(iterations=8, regularizer=f"dropout({schedule})", densify_every=0))
+    trainer.train()
+    trained = model_of(trainer)
+    assert trained.dropout == pytest.approx(last)
+    torch.testing.assert_close(trained.test_opacities, (1 - last) * trained.gaussians.opacities)
