@@ -18,7 +18,7 @@ class TrainConfig:
     """Settings of one training run. The defaults are those of the recipe ``3dgs``, but 3,000 iterations.
 
     Raises:
-        TypeError: if a number of steps, models, Gaussians or bands, or the seed, is no integer.
+        TypeError: if a number of steps, models, Gaussians or bands, or the seed, is no integer, or another number none.
         ValueError: if a setting is out of range, or two contradict each other.
     """
 
@@ -110,11 +110,16 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            name, value = field.name, getattr(self, field.name)
+            name, value, kind = field.name, getattr(self, field.name), str(field.type).removesuffix(" | None")
             if isinstance(value, float) and not math.isfinite(value):  # JSON has no word for it
                 raise ValueError(f"{name} must be finite, got {value}.")
-            if type(value) not in _INTEGERS.get(str(field.type), (type(value),)):  # no checkpoint with it could be read
+            if value is None and kind != field.type:
+                continue
+            # No checkpoint with another one could be written, or read. A bool is no number here.
+            if kind == "int" and type(value) is not int:
                 raise TypeError(f"{name} must be an integer, got {value!r}: convert it with int().")
+            if kind == "float" and (isinstance(value, bool) or not isinstance(value, int | float)):
+                raise TypeError(f"{name} must be a number of Python's, got {value!r}: convert it with float().")
         for names, right, rule, hint in _RANGES:
             for name in names:
                 if not right(getattr(self, name)):
@@ -132,7 +137,7 @@ class TrainConfig:
     @property
     def regularizers(self) -> str:
         """All regularizers as one expression, dropout and noise first."""
-        own = [f"{name}({rate!r})" for name, rate in (("dropout", self.dropout), ("noise", self.noise)) if rate]
+        own = [f"{name}({rate})" for name, rate in (("dropout", self.dropout), ("noise", self.noise)) if rate]
         return " + ".join([*own, *([self.regularizer] if self.regularizer.strip() else [])])
 
     @property
@@ -172,9 +177,6 @@ def saved_config(values: Any, where: str) -> TrainConfig:
 
 _RENAMED_RENDERERS = {"torch": "builtin"}
 _RENAMED_SETTINGS = {"fields": "models"}
-
-_INTEGERS: dict[str, tuple[type, ...]] = {"int": (int,), "int | None": (int, type(None))}
-"""Types of values by annotation; a bool is no number here."""
 
 _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
     (("iterations", "models"), lambda x: x >= 1, "at least 1", ""),

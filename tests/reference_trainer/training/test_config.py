@@ -1,7 +1,10 @@
 import dataclasses
+import json
 import math
 
+import numpy as np
 import pytest
+import torch
 
 from reference_trainer.training.assembly import check, make_regularizer
 from reference_trainer.training.config import TrainConfig, saved_config
@@ -90,6 +93,24 @@ def test_counts_are_integers(field, value):
     """A training with another number had run, and its checkpoint was refused as damaged."""
     with pytest.raises(TypeError, match=rf"{field} must be an integer, got {value!r}: convert it with int\(\)"):
         TrainConfig(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("means_rate", np.float32(1e-4)), ("opacity_decay", torch.tensor(0.9)), ("noise", True), ("prune_size", "0.2")],
+)
+def test_rates_are_numbers_that_a_checkpoint_can_hold(field, value):
+    """JSON knows no other, and read True as no number."""
+    with pytest.raises(TypeError, match=rf"{field} must be a number of Python's, got .*: convert it with float\(\)"):
+        TrainConfig(**{field: value})
+
+
+def test_a_rate_of_numpy_is_written_like_one_of_python():
+    config = TrainConfig(dropout=np.linspace(0.0, 0.4, 5)[1], noise=np.float64(1e-5))
+    assert config.regularizers == "dropout(0.1) + noise(1e-05)"
+    check(config)
+    read = json.loads(json.dumps(dataclasses.asdict(config)))
+    assert saved_config(read, "config.json") == config
 
 
 @pytest.mark.parametrize(
