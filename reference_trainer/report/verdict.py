@@ -67,7 +67,7 @@ def natural_order(config: TrainConfig) -> tuple[int, bool]:
         >>> natural_order(TrainConfig(noise=0.8)) < natural_order(TrainConfig(dropout=0.2, noise=0.8))
         True
     """
-    kinds = set(re.findall(r"[A-Za-z_]\w*(?=\()|[A-Za-z_]\w*$", config.regularizers))
+    kinds = set(re.sub(r"\([^)]*\)", "", config.regularizers).replace("+", " ").split())
     order = [set(), {"dropout"}, {"noise"}, {"dropout", "noise"}, kinds]
     other = (config.loss, config.density) != (_USUAL.loss, _USUAL.density)
     return 4 if other else order.index(kinds), config.analytic

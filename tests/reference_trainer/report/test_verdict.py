@@ -35,6 +35,8 @@ def test_runs_are_called_and_ordered_as_people_do():
     assert [natural_name(config) for config in configs] == [*names, "Baseline, absgrad"]
     assert sorted(reversed(configs[:-1]), key=natural_order) == configs[:-1]
     assert natural_order(configs[-1]) > natural_order(configs[4])
+    assert natural_order(TrainConfig(regularizer="density + noise(0.8)")) > natural_order(configs[4])  # no noise alone
+    assert natural_order(TrainConfig(regularizer="noise + dropout(0.2)")) == natural_order(configs[4])
 
 
 @pytest.mark.parametrize(
