@@ -206,7 +206,8 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
         return text, [*limits, "Nothing stands beside it: add a second run to compare it with."]
     said = {rows.name: _said(rows, reference, split) for rows in rest}
     sign, key = (1, "psnr") if split == "test" else (-1, "ca_exact_half")
-    best = max(rest, key=lambda rows: sign * mean_std(rows.values(split, key))[0])
+    measured = [rows for rows in rest if rows.values(split, key)]
+    best = max(measured or rest, key=lambda rows: sign * mean_std(rows.values(split, key))[0])
     merit = "highest PSNR" if split == "test" else "least co-adaptation"
     text = f"{best.name}{f' (the {merit} of {len(rest)})' * (len(rest) > 1)}: {said[best.name]} than "
     text += f"{reference.name if not reference.baseline else 'the baseline'} {where}."

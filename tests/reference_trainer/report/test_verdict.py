@@ -88,6 +88,13 @@ def test_without_test_views_nothing_is_said_about_quality():
     assert "exact CA 4.00e-3 around the training views" in verdict(pair[:1])[0]
 
 
+def test_what_has_no_score_is_not_the_best():
+    strategies = [rows(name, [30.0], [ca], split="around") for name, ca in (("A", 4e-3), ("B", math.nan), ("C", 2e-3))]
+    found, evidence = verdict(strategies)
+    assert found.startswith("C (the least co-adaptation of 2): 50 % less co-adaptation than A")
+    assert evidence[0] == "B: nothing measured that is different."
+
+
 def test_the_best_and_the_better_are_marked_where_that_is_a_merit():
     columns = score_columns([rows("A", [20.0], [0.004]), rows("B", [20.5], [0.005]), rows("C", [20.5], [math.nan])])
     psnr, ca, gaussians, _ = columns
