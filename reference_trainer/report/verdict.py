@@ -209,7 +209,9 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
     measured = [rows for rows in rest if rows.values(split, key)]
     best = max(measured or rest, key=lambda rows: sign * mean_std(rows.values(split, key))[0])
     merit = "highest PSNR" if split == "test" else "least co-adaptation"
-    text = f"{best.name}{f' (the {merit} of {len(rest)})' * (len(rest) > 1)}: {said[best.name]} than "
+    last = said[best.name].rpartition(" and ")[2]
+    than = "from" if "told apart" in last else "as" if last.startswith("the same") else "than"
+    text = f"{best.name}{f' (the {merit} of {len(rest)})' * (len(rest) > 1)}: {said[best.name]} {than} "
     text += f"{reference.name if not reference.baseline else 'the baseline'} {where}."
     evidence = [f"{name}: {what}." for name, what in said.items() if name != best.name]
     seeds = {len(rows.results) for rows in strategies}
@@ -240,6 +242,7 @@ def _said(rows: Rows, reference: Rows, split: str) -> str:
         delta, margin = found
         usual = mean_std(reference.values(split, "ca_exact_half"))[0]
         part = f"{abs(delta) / usual:.0%}".replace("%", " %") if usual else f"{abs(delta) * 1e3:.2f}e-3"
-        text = f"{part} {'more' if delta > 0 else 'less'} co-adaptation"
-        parts.append(text if not abs(delta) <= margin else f"a co-adaptation that cannot be told apart ({text})")
+        part += " more" if delta > 0 else " less"
+        text = f"{part} co-adaptation" if float(part.split()[0].removesuffix("e-3")) else "the same co-adaptation"
+        parts.append(text if not abs(delta) <= margin else f"a co-adaptation that cannot be told apart ({part})")
     return " and ".join(parts) or "nothing measured that is different"

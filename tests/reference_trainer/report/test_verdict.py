@@ -58,6 +58,14 @@ def test_one_seed_is_said_to_have_no_spread():
     assert rule.startswith("One seed: no spread is known")
 
 
+@pytest.mark.parametrize("ca", [0.004, 0.0])
+def test_equal_scores_are_called_the_same(ca):
+    found, _ = verdict([rows("A", [20.0], [ca]), rows("B", [20.0], [ca])])
+    assert found == "B: the same PSNR and the same co-adaptation as A on the 2 test views."
+    mixed, _ = verdict([rows("A", [20.0], [ca]), rows("B", [20.1], [ca])])
+    assert mixed == "B: 0.10 dB higher PSNR and the same co-adaptation as A on the 2 test views."
+
+
 def test_what_is_within_two_standard_errors_is_not_told_apart():
     # The difference of the means is 1 and its standard error sqrt(s^2 / 2 + s^2 / 2) = s; s is half the range times
     # the square root of 2.
