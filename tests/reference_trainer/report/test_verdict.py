@@ -96,6 +96,14 @@ def test_without_test_views_nothing_is_said_about_quality():
     assert "exact CA 4.00e-3 around the training views" in verdict(pair[:1])[0]
 
 
+def test_scores_on_different_test_views_are_said_to_be():
+    one, two = rows("A", [20.0], [0.004]), rows("B", [21.0], [0.004])
+    two.results[0]["views"].append({"split": "test", "name": "another"})
+    found, evidence = verdict([one, two])
+    assert found == "B: 1.00 dB higher PSNR and the same co-adaptation as A each on its own test views."
+    assert evidence[-1].startswith("The runs were not tested on the same views")
+
+
 def test_what_has_no_score_is_not_the_best():
     strategies = [rows(name, [30.0], [ca], split="around") for name, ca in (("A", 4e-3), ("B", math.nan), ("C", 2e-3))]
     found, evidence = verdict(strategies)
