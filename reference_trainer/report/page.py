@@ -32,7 +32,6 @@ from reference_trainer.report.verdict import (
     FEWEST_SEEDS,
     Rows,
     differences,
-    natural_name,
     natural_order,
     run_colors,
     score_columns,
@@ -258,28 +257,32 @@ def _strategies(
     colors: dict[str, str],
 ) -> list[Rows]:
     """Return the rows of every strategy: runs that differ in nothing but the seed are one, as in a comparison."""
-    found: dict[object, tuple[str, list[str], dict[int, dict[str, Any]]]] = {}
-    for label, of in results.items():
+    found: dict[object, tuple[list[str], dict[int, dict[str, Any]]]] = {}
+    for label, run in runs.items():
         scene, config = configs[label]
-        key: object = label if runs[label] in whole else (scene, dataclasses.replace(config, seed=0))
-        if key in found and config.seed in found[key][2]:
+        of = {config.seed: results[label]} if label in results else {}
+        if run in whole:
+            for other in map(read_results, sorted(path.parent for path in run.parent.glob(f"seed_*/{RESULTS}"))):
+                of.setdefault(other["config"]["seed"], other)
+        key: object = label if run in whole else (scene, dataclasses.replace(config, seed=0))
+        if key in found and config.seed in found[key][1]:
             key = label
-        rows = found.setdefault(key, (label, [], {}))[2]
-        found[key][1].append(label)
-        rows[config.seed] = of
-        if runs[label] in whole:
-            for seed in sorted(runs[label].parent.glob(f"seed_*/{RESULTS}")):
-                other = read_results(seed.parent)
-                rows.setdefault(other["config"]["seed"], other)
+        if of:
+            same, seeds = found.setdefault(key, ([], {}))
+            same.append(label)
+            seeds |= of
+    first = [same[0] for same, _ in found.values()]
+    path_of = dict(zip(runs, labels([*runs.values()]), strict=True))
+    paths = [", ".join(path_of[label] for label in same) for same, _ in found.values()]
+    names = unique_names([configs[label][1] for label in first], paths)
     return [
         Rows(
-            name if len(names) == 1 else natural_name(config),
-            not natural_order(config)[0],
-            list(rows.values()),
-            colors[name],
+            name if len(same) > 1 else same[0],
+            not natural_order(configs[same[0]][1])[0],
+            list(seeds.values()),
+            colors[same[0]],
         )
-        for name, names, rows in found.values()
-        for config in [configs[name][1]]
+        for name, (same, seeds) in zip(names, found.values(), strict=True)
     ]
 
 

@@ -207,16 +207,16 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
         found = [f"PSNR {psnr:.2f} dB"] * math.isfinite(psnr) + [f"exact CA {ca * 1e3:.2f}e-3"] * math.isfinite(ca)
         text = f"{reference.name}: {' and '.join(found) or 'nothing was measured'} {where}."
         return text, [*limits, "Nothing stands beside it: add a second run to compare it with."]
-    said = {rows.name: _said(rows, reference, split) for rows in rest}
+    said = [_said(rows, reference, split) for rows in rest]
     sign, key = (1, "psnr") if split == "test" else (-1, "ca_exact_half")
-    measured = [rows for rows in rest if rows.values(split, key)]
-    best = max(measured or rest, key=lambda rows: sign * mean_std(rows.values(split, key))[0])
+    measured = [i for i, rows in enumerate(rest) if rows.values(split, key)] or [0]
+    best = max(measured, key=lambda i: sign * mean_std(rest[i].values(split, key))[0])
     merit = "highest PSNR" if split == "test" else "least co-adaptation"
-    last = said[best.name].rpartition(" and ")[2]
+    last = said[best].rpartition(" and ")[2]
     than = "from" if "told apart" in last else "as" if last.startswith("the same") else "than"
-    text = f"{best.name}{f' (the {merit} of {len(rest)})' * (len(rest) > 1)}: {said[best.name]} {than} "
+    text = f"{rest[best].name}{f' (the {merit} of {len(rest)})' * (len(rest) > 1)}: {said[best]} {than} "
     text += f"{reference.name if not reference.baseline else 'the baseline'} {where}."
-    evidence = [f"{name}: {what}." for name, what in said.items() if name != best.name]
+    evidence = [f"{rows.name}: {said[i]}." for i, rows in enumerate(rest) if i != best]
     seeds = {len(rows.results) for rows in strategies}
     if min(seeds) > 1:
         evidence.append(

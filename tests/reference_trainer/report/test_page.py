@@ -248,6 +248,34 @@ def test_what_is_no_run_or_no_pair_is_refused(run, found, tmp_path, monkeypatch)
     assert not (tmp_path / "page.html").exists()
 
 
+def strategies(found, folders, tmp_path, monkeypatch) -> dict:
+    """The data of a page about runs that all are drawn as one."""
+    monkeypatch.setattr(page_module, "find", lambda _, label, **__: dataclasses.replace(found, label=label))
+    return Parsed(write_report(folders, tmp_path / "page.html")).data
+
+
+def test_strategies_of_one_name_are_told_apart_by_their_seeds(found, tmp_path, monkeypatch):
+    runs = [
+        trained(tmp_path / f"{name}/{seed}", seed, psnr + seed, dropout=0.2, iterations=iterations)
+        for name, psnr, iterations in (("a", 20.0, 30), ("b", 22.0, 60), ("c", 24.0, 90))
+        for seed in (0, 1)
+    ]
+    data = strategies(found, runs, tmp_path, monkeypatch)
+    names = [f"Dropout 0.2 ({name}/0, {name}/1)" for name in "abc"]
+    assert [(of["name"], of["seeds"]) for of in data["strategies"]] == [(name, 2) for name in names]
+    assert data["verdict"].startswith(f"{names[2]} (the highest PSNR of 2): 4.00 dB higher PSNR")
+    assert data["evidence"][0].startswith(f"{names[1]}: 2.00 dB higher PSNR")
+
+
+def test_seeds_count_although_the_first_of_a_comparison_is_not_finished(found, tmp_path, monkeypatch):
+    for seed in (0, 1, 2):
+        trained(tmp_path / f"mine/seed_{seed}", seed, 20.0 + seed)
+    (tmp_path / "mine/seed_0/results.json").unlink()
+    data = strategies(found, [tmp_path], tmp_path, monkeypatch)
+    assert [(of["name"], of["seeds"]) for of in data["strategies"]] == [("Baseline", 2)]
+    assert data["scores"][0]["cells"][0]["text"] == "21.50 ± 0.71"
+
+
 def test_text_from_files_cannot_end_the_data(run, found, tmp_path, monkeypatch):
     bad = "</script><script>alert(1)</script>"
     monkeypatch.setattr(page_module, "find", lambda *_, **__: dataclasses.replace(found, label=bad))
