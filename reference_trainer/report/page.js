@@ -18,6 +18,7 @@ const TERMS = {
   "covered": "Mean opacity of the picture: 1 where Gaussians cover it all.",
   "Gaussians": "Number of Gaussians of the model.",
   "seconds": "Time of the training on the machine it ran on.",
+  "half is held by": "The fewest Gaussians that together hold half of the exact CA, as a share of all.",
   "held by": "Share of the exact CA that these Gaussians hold, those first that hold most.",
 };
 let hint = null; // whose definition is shown

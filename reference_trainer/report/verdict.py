@@ -170,7 +170,7 @@ def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:
         cells: list[dict[str, Any]] = []
         for i, (of, mean) in enumerate(zip(strategies, rounded, strict=True)):
             cell = {"text": format_mean_std(of.values(split, key), unit=unit, decimals=decimals), "best": mean == best}
-            if key == "psnr_expected":
+            if key == "psnr_expected" and not math.isnan(mean):
                 ends = (mean_std(of.values(split, end))[0] for end in ("psnr_low", "psnr_high"))
                 cell["interval"] = " to ".join(f"{end:.{decimals}f}" for end in ends)
             if i and highest is not None and math.isfinite(delta := mean - rounded[0]):

@@ -220,6 +220,8 @@ def test_the_page_fits_its_window_in_light_and_dark(turned, width, scheme):
         hint = page.run("document.querySelector('.hint').focus(); hint.ariaDescription")
         tip = page.run("[$('tip').hidden, $('tip').textContent, $('tip').getBoundingClientRect().right]")
         assert tip[:2] == [False, hint]
+        half = "[...document.querySelectorAll('.hint')].find(x => x.textContent === 'half is held by').ariaDescription"
+        assert "fewest Gaussians" in page.run(half)  # a share of them, not of the score
         assert tip[2] <= width
 
 

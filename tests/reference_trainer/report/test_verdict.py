@@ -122,6 +122,14 @@ def test_the_best_and_the_better_are_marked_where_that_is_a_merit():
     assert not any(cell["best"] or "delta" in cell for cell in gaussians["cells"])
 
 
+def test_what_an_older_version_did_not_measure_has_no_interval():
+    old, new = rows("Old", [20.0], [0.004]), rows("New", [20.0], [0.004])
+    new.results[0]["mean"]["test"] |= {"psnr_expected": 19.0, "psnr_low": 17.5, "psnr_high": 20.5}
+    (cells,) = (of["cells"] for of in score_columns([old, new]) if of["title"] == "expected PSNR")
+    assert cells[0] == {"text": "n/a", "best": False}
+    assert (cells[1]["text"], cells[1]["interval"]) == ("19.0", "17.5 to 20.5")
+
+
 def test_two_trainings_are_told_apart_by_three_seeds_and_not_by_fewer():
     one = rows("One", [20.0, 20.1, 20.2], [0.005, 0.0049, 0.0051])
     two = rows("Two", [20.5, 20.7, 20.6], [0.0051, 0.005, 0.0049])
