@@ -221,7 +221,8 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
                     picture = shown.render(DisplayOptions(), camera)._replace(note=str(error))
                 if share := self._photograph.value / 100:
                     if (view := self._photograph_at(camera)) is None:
-                        picture = picture._replace(note=f"{picture.note}\n\nNo photograph from here: go to a camera.")
+                        notes = filter(None, (picture.note, "no photograph from here: go to a camera"))
+                        picture = picture._replace(note="; ".join(notes))
                     else:
                         picture = picture._replace(image=with_photograph(picture.image, camera, view, share))
                 pictures[name] = picture
@@ -244,19 +245,19 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         def frames() -> Iterator[torch.Tensor]:
             for number, camera in enumerate(cameras):
                 self._status.content = f"flight: picture {number + 1} of {len(cameras)}"
-                yield self._sheet(camera)
+                yield self._sheet(camera, notes=False)  # their lengths differ, and so would the pictures
 
         with tempfile.TemporaryDirectory() as folder:
             file_ = save_film(Path(folder), "flight", [*frames()])
             window.client.send_file_download(file_.name, file_.read_bytes(), save_immediately=True)
         self._status.content = f"flight: {len(cameras)} pictures in {file_.name}"
 
-    def _sheet(self, camera: Camera) -> torch.Tensor:
-        """Return what a page shows, (3, H, W), with the names of the models and color bars."""
-        pictures = self._draw(camera)
+    def _sheet(self, camera: Camera, *, notes: bool = True) -> torch.Tensor:
+        """Return what a page shows, (3, H, W), with the names of the models, color bars, and the notes on it."""
+        pictures, mode = self._draw(camera), self._options.mode
         return side_by_side(
             [picture.image for picture in pictures.values()],
-            [", ".join(filter(None, (name, self._options.mode, picture.note))) for name, picture in pictures.items()],
+            [", ".join(filter(None, (name, mode, of.note * notes))) for name, of in pictures.items()],
             scales=[picture.scale and picture.scale[:2] for picture in pictures.values()],
         )
 

@@ -1,4 +1,5 @@
 import dataclasses
+import sys
 import time
 from io import BytesIO
 from itertools import cycle
@@ -120,7 +121,11 @@ def test_a_photograph_is_laid_over_its_own_camera_only(run, viewer, page):
     page.camera.position = page.camera.position + np.array([0.5, 0, 0])
     viewer._moved()
     page.settle()
-    assert "No photograph from here" in viewer._status.content
+    assert "no photograph from here" in viewer._status.content
+    viewer._ask(page, "screenshot")
+    viewer.update()
+    with Image.open(BytesIO(page.files["view.png"])) as file:
+        assert file.size[0] >= page.shown[-1].shape[1]
 
 
 @pytest.mark.slow
@@ -169,6 +174,22 @@ def test_a_flight_along_added_cameras_is_a_movie(run, viewer, page, monkeypatch)
         with Image.open(BytesIO(content)) as movie:
             assert movie.n_frames == 7
             assert movie.size[0] >= view.camera.width
+
+
+def test_a_flight_of_two_models_has_pictures_of_one_size_whatever_their_notes(run, viewer, page, monkeypatch):
+    monkeypatch.setattr(window, "MOVIE_FRAMES", 4)
+    monkeypatch.setitem(sys.modules, "av", None)  # a WebP, which cannot be of several sizes
+    drawn, lengths = ViewerModel.render, cycle(range(9))
+    monkeypatch.setattr(ViewerModel, "render", lambda *of: drawn(*of)._replace(note="9" * next(lengths)))
+    model, scene = load_run_model(run[0])
+    viewer.show(model, measured_views(scene), "other")
+    for view in scene.train[:2]:
+        page.camera = Client(view.camera.resized(64, 48)).camera  # narrower than its title
+        viewer._ask(page, "add to path")
+    viewer._ask(page, "flight")
+    viewer.update()
+    with Image.open(BytesIO(page.files["flight.webp"])) as movie:
+        assert movie.n_frames == 5
 
 
 def test_up_is_across_the_horizontal_axes_of_cameras_held_level():
