@@ -139,7 +139,8 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         """Draw whatever pages need until Ctrl-C."""
         with contextlib.suppress(KeyboardInterrupt):
             while True:
-                self._changed.wait(self.update())
+                wait = self.update()
+                self._changed.wait(1.0 if wait is None else wait)  # Ctrl-C ends no wait without a limit on Windows
                 self._changed.clear()
 
     def follow(self, trainer: Trainer) -> None:

@@ -241,6 +241,18 @@ def test_a_model_on_a_card_is_shown_from_an_orbit_around_it(run, viewer, card):
     np.testing.assert_allclose(viewer._server.initial_camera.position, first, rtol=1e-6)
 
 
+def test_an_idle_page_waits_for_a_limited_time(viewer, monkeypatch):
+    waits = []
+
+    def wait(timeout=None):
+        waits.append(timeout)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(viewer._changed, "wait", wait)
+    viewer.serve()
+    assert 0 < waits[0] <= 1  # on Windows, Ctrl-C is not heard before the end of a wait
+
+
 def test_a_training_that_nobody_looks_at_is_left_alone(viewer):
     viewer.follow(None)
 
