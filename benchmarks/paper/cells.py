@@ -301,8 +301,8 @@ def _rounded(data: Any) -> Any:
 
 def _commit() -> str | None:
     """Return the commit of this checkout, with "-dirty" if files differ from it; None outside a checkout."""
-    root = Path(__file__).parents[3]
-    if not (root / ".git").exists():  # an installed package may lie within another project's repository
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():  # an unpacked archive may lie within another project's repository
         return None
     command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:

@@ -4,6 +4,8 @@ import dataclasses
 import itertools
 import json
 import math
+import subprocess
+from pathlib import Path
 
 import pytest
 import torch
@@ -35,6 +37,16 @@ ALL = Grid(CLAIMS, EVERY)
 
 
 # The grid
+
+
+def test_a_row_names_the_commit_of_this_checkout():
+    root = Path(__file__).parents[3]
+    if not (root / ".git").exists():
+        pytest.skip("needs a checkout")
+    head = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+    commit = cells_module._commit()
+    assert commit is not None
+    assert head.stdout.startswith(commit.removesuffix("-dirty"))
 
 
 def test_every_training_is_declared_once_and_covers_its_claims():
