@@ -197,7 +197,7 @@ def steps(n: int) -> dict[str, int]:
     return parts | {"n": n, "last": n - 1, "half_1": n // 2 + 1, "quarter_1": n // 4 + 1}
 
 
-_ROOT = Path(__file__).parents[2]  # before the tests in the path: their folders have names of packages
+_ROOT = Path(__file__).resolve().parents[1]  # before the tests in the path: their folders have names of packages
 _PLYS = ("point_cloud/iteration_{n}/point_cloud.ply", "ply/point_cloud_{last}.ply", "export/splat.ply")
 _TIMED = Path(__file__).resolve().with_name("timed.py")
 

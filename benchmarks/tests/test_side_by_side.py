@@ -2,9 +2,11 @@
 
 import argparse
 import json
+import os
 import random
 import sys
 import textwrap
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -94,8 +96,9 @@ def test_depth_of_a_network_that_is_downloaded_is_that_of_files(tmp_path, monkey
 def test_another_interpreter_may_evaluate(tmp_path, monkeypatch):
     called = []
 
-    def run(command, **_):
+    def run(command, env, **_):
         called.append((command[0], *command[4:6]))
+        assert (Path(env["PYTHONPATH"].split(os.pathsep)[0]) / "reference_trainer/cli").is_dir()  # this checkout's
         if command[0] == "evaluating":
             (tmp_path / "evaluation").mkdir()
             test = dict.fromkeys(("psnr", "ssim", "ca", "ca_exact_half"), 1.0)
