@@ -1,4 +1,4 @@
-"""The pictures of the pages that people see: ``PYTHONPATH=tests python -m benchmarks.screenshots RUN_A RUN_B``.
+"""The pictures of the pages that people see: ``python -m benchmarks.screenshots RUN_A RUN_B``.
 
 Needs Chromium, and viser for the viewer. The runs of the pictures in docs/images are two of ``ca-reg compare --path
 fern --images images_16 --iterations 3000 --opacity-reset-every 0 --monitor-every 100 --seeds 1``: the baseline and
@@ -13,13 +13,13 @@ from pathlib import Path
 
 import torch
 import tyro
-from browser import Page
 
 from reference_trainer.evaluation.pictures import save_png
 from reference_trainer.report.page import write_report
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.virtual_cameras import measured_views
 from reference_trainer.viewer.window import Viewer
+from tests.browser import Page
 
 __all__ = ["report_picture", "viewer_picture"]
 

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 
-from browser import Page
 from torch import Tensor
 
 from ca_reg import CAMonitor
@@ -21,6 +20,7 @@ from reference_trainer.scenes.virtual_cameras import interpolate_cameras, measur
 from reference_trainer.training.trainer import Trainer
 from reference_trainer.viewer.picture import DisplayOptions, ViewerModel
 from reference_trainer.viewer.window import Viewer
+from tests.browser import Page
 
 LOOKS = {
     "render": DisplayOptions(),
