@@ -75,10 +75,13 @@ def pictures(trainer: Trainer) -> None:
     def details(opacity: Tensor, view: View) -> dict[str, Tensor]:
         return training_snapshot(model, view)
 
-    with tempfile.TemporaryDirectory() as folder, CAMonitor(model.ca_score(), folder, views=views) as monitor:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        CAMonitor(model.ca_score(), folder, views=views, details=details) as monitor,
+    ):
         both = []
         for step in range(12):
-            shown = timed(lambda step=step: monitor._show(monitor.writer, details, model.gaussians.opacities, step))
+            shown = timed(lambda step=step: monitor._show(model.gaussians.opacities, step))
             both.append((shown, timed(trainer.train_step)))
     shown, step = (statistics.median(of) for of in zip(*both[2:], strict=True))
     print(f"{len(trainer.gaussians):,} Gaussians: pictures {shown * 1e3:.0f} ms, {shown / step:.1f} steps' time")
