@@ -90,7 +90,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     rows = json.loads(options.rows.read_text()) if options.rows.exists() else {}
-    for name, run in (each.split("=") for each in options.runs):
+    for name, run in (each.split("=", 1) for each in options.runs):
         if name not in rows:
             found = compared(Path(run), options.fractions, options.steps)
             rows[name] = {what: [*(round(x, 3) for x in values)] for what, values in found.items()}

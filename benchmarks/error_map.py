@@ -370,7 +370,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     if options.picture:
-        draw(dict(each.split("=") for each in options.runs), options.picture)
+        draw(dict(each.split("=", 1) for each in options.runs), options.picture)
         return
     if not options.runs:
         print(tables(json.loads(options.rows.read_text("utf-8"))))
@@ -379,7 +379,7 @@ def main() -> None:
     options.keep.mkdir(parents=True, exist_ok=True)
     models: dict[str, list[Seen]] = {}
     times: dict[str, dict[str, float]] = {}
-    for name, run in (each.split("=") for each in sorted(options.runs)):
+    for name, run in (each.split("=", 1) for each in sorted(options.runs)):
         file = options.keep / f"{name}{'-rivals' if options.rivals else ''}.pt"
         if not file.exists():
             model, scene = load_run_model(Path(run.split(",")[0]))

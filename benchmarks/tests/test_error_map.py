@@ -1,11 +1,13 @@
 import json
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from benchmarks import error_map
 from benchmarks.clean_by_error import error_shares
 from benchmarks.error_map import Quality, Seen, ause, fitted, predict, ranked
 from benchmarks.error_map_tables import tables
@@ -94,6 +96,15 @@ def test_tables_have_the_means_and_who_is_ahead():
     assert "| recommended over plain | 1 | +1.00 | -3.00 | 0 |" in lines
     assert "| plain, 2 | 100% | 100% | +2.00 | 2.2 | 100% |" in lines  # off by 3 and 1 dB
     assert "| **error map** | 0.200 | 0.400 | 0.300 |" in lines
+
+
+def test_the_folder_of_a_run_may_have_an_equals_sign(monkeypatch):
+    drawn = {}
+    monkeypatch.setattr(error_map, "draw", lambda runs, file: drawn.update(runs))
+    run = "runs/noise_0.8_scale=True/seed_0"  # as compare calls it
+    monkeypatch.setattr(sys, "argv", ["error_map", f"fern-noise-0={run}", "--picture", "picture.webp"])
+    error_map.main()
+    assert drawn == {"fern-noise-0": run}
 
 
 def test_the_page_has_the_tables_of_its_rows():
