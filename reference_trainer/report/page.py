@@ -57,6 +57,8 @@ __all__ = ["compare_two", "labels", "view_name", "write_report"]
 
 _log = logging.getLogger(__name__)
 
+VIEWS = 8
+"""Of each split, unless others are asked for."""
 EACH = 3
 """Views that nobody took, at most, of those between the training cameras and of those beyond."""
 
@@ -65,7 +67,7 @@ def write_report(
     runs: Sequence[Path],
     out: Path | None = None,
     *,
-    views: int = 8,
+    views: int = VIEWS,
     device: str = "cpu",
     trust: Collection[str] = (),
 ) -> Path:
@@ -114,7 +116,9 @@ def write_report(
                 f"{found[0].scene.name} and {run} on {found[-1].scene.name}: write a report for each."
             )
     data = _data(dict(zip(names, runs, strict=True)), found, whole=set(runs) - set(folders))
-    made = f"{shlex.join(['ca-reg', 'report', *map(str, folders)])} · ca_reg {ca_reg.__version__} · "
+    command = ["ca-reg", "report", *map(str, folders)]
+    command += ["--views", str(views)] * (views != VIEWS) + ["--trust", *sorted(trust)] * bool(trust)
+    made = f"{shlex.join(command)} · ca_reg {ca_reg.__version__} · "
     data["made"] = made + datetime.now().strftime("%Y-%m-%d %H:%M")
     page = Template(_part("page.html")).substitute(
         title=f"{found[0].scene.name}: {', '.join(names)}".replace("&", "&amp;").replace("<", "&lt;"),
