@@ -27,6 +27,7 @@ from torch import Tensor
 from benchmarks.counts import Model, counts_table, lists_table
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier
+from ca_reg.neighbors import nearest_neighbors
 from reference_trainer.render import describe_engine, rasterize, render_masks, render_moments, splat, use_engine
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.training.config import TrainConfig
@@ -80,6 +81,10 @@ def _times() -> Iterator[str]:
             leaves = [x.clone().requires_grad_() for x in model.tensors]  # noqa: B023
             rasterize(splat(*leaves[:4], model.camera, colors=leaves[4])).image.square().sum().backward()  # noqa: B023
 
+        def drawn(opacity: Tensor, camera: Any) -> tuple[Tensor, Tensor]:
+            out = rasterize(splat(*model.tensors[:3], opacity, camera, colors=model.tensors[4]))  # noqa: B023
+            return out.image, out.alpha
+
         def masks() -> Any:
             splats = splat(*model.tensors[:4], model.camera, colors=model.tensors[4])  # noqa: B023
             return render_masks(splats, model.tensors[3] * keep)  # noqa: B023
@@ -88,12 +93,15 @@ def _times() -> Iterator[str]:
             "render": torch.no_grad()(forward),
             "render and gradients": backward,
             "five masks": torch.no_grad()(masks),
-            "exact score": torch.no_grad()(partial(score, model.tensors[3], model.camera)),
+            "score of five renders": partial(CAScore(drawn), model.tensors[3], model.camera),
+            "exact score": partial(score, model.tensors[3], model.camera),
         }
         for engine in ("triton", *(["torch"] if name == "small" else [])):
             use_engine(engine)
             for label, work in works.items():
                 yield f"| {name} | {label} | {engine} | {' | '.join(_measure(work))} |"
+        neighbors = partial(nearest_neighbors, model.tensors[0], 10)
+        yield f"| {name} | 10 neighbors of all | - | {' | '.join(_measure(neighbors))} |"
         yield from _gsplat_times(name, model)
     use_engine("triton")
     trainer = Trainer(synthetic_scene(), TrainConfig(dropout=0.2), device)
