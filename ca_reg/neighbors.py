@@ -34,7 +34,7 @@ def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
         Squared distances, at least float32, and the neighbors' indices, int64, nearest first; shape (N, k) each.
 
     Raises:
-        ValueError: if the shape is not (N, 3), or N is not above k.
+        ValueError: if the shape is not (N, 3), N is not above k, or a coordinate is nan.
 
     Example:
         >>> points = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0]])
@@ -101,6 +101,8 @@ def _by_leaves(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     ]
     numbers, order = torch.cat(within).sort(descending=True)
     most = numbers.tolist()  # the one wait for a card
+    if most[-1] == 0:  # a box that is not at a distance of 0 from itself
+        raise ValueError("points must be finite, got nan: remove these Gaussians, or stop a training that diverged.")
     squares, indices = points.new_empty(ids.numel(), count), torch.empty_like(ids).view(-1, 1).repeat(1, count)
     start = 0
     while start < len(order):

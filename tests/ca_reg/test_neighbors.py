@@ -88,6 +88,16 @@ def test_on_any_device(device):
     _check(found.cpu(), numbers.cpu(), points, 7)
 
 
+@pytest.mark.parametrize("tree_from", [0, 10**9], ids=["tree", "leaves"])
+@pytest.mark.parametrize("n", [9, 601])
+def test_points_that_are_no_numbers_are_refused(monkeypatch, n, tree_from):
+    monkeypatch.setattr(neighbors, "TREE_FROM", tree_from)
+    points = _points("spread", n)
+    points[n // 2, 1] = torch.nan
+    with pytest.raises(ValueError, match="finite"):
+        nearest_neighbors(points, 3)
+
+
 @pytest.mark.parametrize("shape", [(3, 3), (9, 2), (9,)])
 def test_other_shapes_are_refused(shape):
     with pytest.raises(ValueError, match=r"\(N, 3\) with N > 3"):
