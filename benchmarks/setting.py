@@ -4,20 +4,23 @@
     python -m benchmarks.setting table setting.json
 
 A row is a training: PSNR of held-out views of training kind, which alone choose, and what `ca-reg train` has measured
-at the test views. Plain 3DGS and dropout alone, against which the chosen one is judged, are rows of the paper's grid.
+at the test views. Plain 3DGS and dropout alone, against which the chosen one is judged, are rows of the paper's grid,
+and of further seeds.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median
 from typing import Annotated, Any, Literal
 
 import torch
 import tyro
+from scipy.stats import binomtest
 
 from benchmarks.guard import OTHER_EXPOSURE, quality
 from benchmarks.paper.rows import Rows, value
@@ -30,7 +33,7 @@ from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["candidate", "choosing", "differences", "judging", "main", "measured"]
+__all__ = ["candidate", "choosing", "differences", "failures", "judging", "main", "measured"]
 
 Row = dict[str, Any]
 """``scene``, ``candidate`` and ``seed``, ``held-out`` PSNR if there are such views, ``test`` figures, ``gaussians``."""
@@ -38,6 +41,12 @@ Row = dict[str, Any]
 _FIGURES = "psnr", "ssim", "lpips", "ca_exact_half"
 CHOSEN = "drawn"
 """The candidate that is judged."""
+SEEDS = 5
+"""From so many on the seeds of a setting stand in the table of failures."""
+FAILURE = 1.0
+"""A training so many dB below the median of its scene and setting has failed."""
+FAILING = ("herz-jesu", "fountain", "dtu-scan65", "sceaux")
+"""The scenes of the study of failures."""
 REFERENCES = Path(__file__).with_name("data") / "paper"
 """Folder with the rows of the paper's grid."""
 _REFERENCES = {"plain": {}, "dropout": {"regularizer": "dropout(0.2)"}}
@@ -66,19 +75,23 @@ def main(
                 write_json(out, rows)
     else:
         rows = json.loads(paths[0].read_text("utf-8"))
-    print(choosing(rows), judging(rows), sep="\n\n")
+    print(choosing(rows), judging(rows), failures(rows), sep="\n\n")
 
 
 def candidate(config: TrainConfig) -> str:
-    """Return the name of a candidate.
+    """Return the name of a candidate, or of what it is compared with.
 
     Example:
         >>> candidate(TrainConfig(dropout=0.2, analytic=True, opacity_decay=0.998))
         'expectation, decay 0.998'
     """
-    if not config.analytic:
-        return "drawn"
-    return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
+    if config.analytic:
+        return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
+    if "warp" in config.loss:
+        return "Binocular3DGS" + (", dropout" if config.dropout else "")
+    if config.opacity_decay < 1:
+        return CHOSEN
+    return "dropout" if config.dropout else "noise" if config.noise else "plain"
 
 
 def measured(run: Path) -> Row:
@@ -88,7 +101,7 @@ def measured(run: Path) -> Row:
     results = read_json(run / "results.json")
     name = Path(options.path).name
     row: Row = {"scene": name, "candidate": candidate(config), "seed": config.seed}
-    if name != "lego":  # has no other photographs
+    if name != "lego" and row["candidate"] not in _REFERENCES:  # lego has no other photographs
         others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(name, ())]
         row["held-out"] = fmean(quality(model, view) for view in others)
     test = results["mean"]["test"]
@@ -122,7 +135,7 @@ def judging(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     lines, perceptual, counts, spreads = [], list[float](), list[float](), list[float]()
     gains = differences(rows, references)
     for scene, pairs in gains.items():
-        compared = {**_references(references, scene), CHOSEN: _chosen(rows, scene)}
+        compared = {**_references(rows, references, scene), CHOSEN: _of(rows, scene, CHOSEN)}
         _, dropout, own = compared.values()
         perceptual.append(_mean(own, "test lpips") - _mean(dropout, "test lpips"))
         counts.append(_mean(own, "gaussians") / _mean(dropout, "gaussians"))
@@ -153,24 +166,66 @@ def differences(rows: Sequence[Row], references: Path = REFERENCES) -> dict[str,
     """Return by how much the chosen one is ahead of the plain training of the same seed, test PSNR, by scene."""
     found: dict[str, list[float]] = {}
     for scene in SCENES:
-        own, plain = _chosen(rows, scene), _references(references, scene)["plain"]
+        own, plain = _of(rows, scene, CHOSEN), _references(rows, references, scene)["plain"]
         if shared := sorted(own.keys() & plain.keys()):
             found[scene] = [value(own[seed], "test psnr") - value(plain[seed], "test psnr") for seed in shared]
     return found
 
 
-def _chosen(rows: Sequence[Row], scene: str) -> dict[int, Row]:
-    return {row["seed"]: row for row in rows if (row["scene"], row["candidate"]) == (scene, CHOSEN)}
+def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
+    """Return the table of the seeds: median, spread and the worst by scene and setting, and how often one fails."""
+    lines, counts, below = [], dict[str, list[int]](), list[bool]()
+    for scene in SCENES:
+        every = {name: _of(rows, scene, name) for name in dict.fromkeys(row["candidate"] for row in rows)}
+        every |= _references(rows, references, scene)
+        figures = {
+            name: {seed: value(row, "test psnr") for seed, row in of.items()}
+            for name, of in every.items()
+            if len(of) >= SEEDS
+        }
+        for name, of in figures.items():
+            middle, worst = median(of.values()), min(of.values())
+            failed = [x < middle - FAILURE for x in of.values()]
+            lines.append({
+                "scene": scene, "setting": name, "seeds": str(len(of)), "median": f"{middle:.2f}",
+                "standard deviation": f"{mean_std(of.values())[1]:.2f}", "worst": f"{worst:.2f}",
+                "to the median": f"{worst - middle:+.2f}", "failures": str(sum(failed)),
+            })  # fmt: skip
+            if scene in FAILING:
+                counts.setdefault(name, []).extend(failed)
+        if CHOSEN in figures and scene in FAILING:
+            below += [x < figures["plain"][seed] for seed, x in figures[CHOSEN].items() if seed in figures["plain"]]
+    if not lines:
+        return f"No setting has {SEEDS} seeds."
+    shares = [f"{name}: {_share(of)} fail" for name, of in counts.items()]
+    together = [*shares, f"{CHOSEN} below plain, same seed: {_share(below)}"]
+    return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {line}" for line in together)])
 
 
-def _references(references: Path, scene: str) -> dict[str, dict[int, Row]]:
-    """Return the kept rows of what the chosen one is compared with, by name and seed."""
+def _share(of: Sequence[bool]) -> str:
+    """Return a share with its interval of 95 % (Clopper and Pearson)."""
+    if not of:
+        return "0 of 0"
+    low, high = binomtest(sum(of), len(of)).proportion_ci(method="exact")
+    return f"{sum(of)} of {len(of)} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def _of(rows: Sequence[Row], scene: str, name: str) -> dict[int, Row]:
+    return {row["seed"]: row for row in rows if (row["scene"], row["candidate"]) == (scene, name)}
+
+
+def _references(rows: Sequence[Row], references: Path, scene: str) -> dict[str, dict[int, Row]]:
+    """Return what the chosen one is compared with, by name and seed: the grid's rows, and own ones of further seeds."""
     kept = Rows(references / f"{scene}.json")
-    return {name: kept.of({"recipe": "3dgs", "iterations": 3_000, **own}) for name, own in _REFERENCES.items()}
+    return {
+        name: _of(rows, scene, name) | kept.of({"recipe": "3dgs", "iterations": 3_000, **own})
+        for name, own in _REFERENCES.items()
+    }
 
 
 def _mean(of: dict[int, Row], figure: str) -> float:
-    return fmean(value(row, figure) for row in of.values())
+    """Return the mean over the seeds for which it was measured."""
+    return fmean([x for row in of.values() if math.isfinite(x := value(row, figure))] or [math.nan])
 
 
 if __name__ == "__main__":
