@@ -87,12 +87,12 @@ def is_own_png(path: Path) -> bool:
 
 
 def save_film(folder: Path, name: str, images: Sequence[Tensor]) -> Path:
-    """Write pictures, at least one, of equal and even size or cut to it, as a film of 20 a second; return its file.
+    """Write pictures, at least one, as a film of 20 a second; return its file.
 
-    An MP4 (H.264), which everything plays, where PyAV is installed; else a looping animated WebP, for browsers. Errors
-    as for `save_png`.
+    Smaller ones get a white margin to the right and below. An MP4 (H.264), which everything plays, cut to an even size,
+    where PyAV is installed; else a looping animated WebP, for browsers. Errors as for `save_png`.
     """
-    frames = [as_pillow(image) for image in images]
+    frames = [as_pillow(image) for image in _of_one_size(images)]
     try:
         import av
     except ImportError:
@@ -253,6 +253,10 @@ def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split:
     ``view`` is the name of the view's files, see `file_names`.
     """
     panels = [read_image(folder / "views" / split / f"{view}{PANEL}.png")[0] for folder in runs.values()]
-    height, width = (max(panel.shape[axis] for panel in panels) for axis in (1, 2))  # labels differ, and versions
-    panels = [pad(panel, (0, width - panel.shape[2], 0, height - panel.shape[1]), value=1.0) for panel in panels]
-    save_png(path, side_by_side(panels, [*map(readable, runs)], columns=1))
+    save_png(path, side_by_side(_of_one_size(panels), [*map(readable, runs)], columns=1))
+
+
+def _of_one_size(images: Sequence[Tensor]) -> list[Tensor]:
+    """Return pictures (3, H, W) with white margins, where labels, or versions, made some of them smaller."""
+    height, width = (max(image.shape[axis] for image in images) for axis in (1, 2))
+    return [pad(image, (0, width - image.shape[2], 0, height - image.shape[1]), value=1.0) for image in images]

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import sys
+
 import matplotlib
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from reference_trainer.evaluation.pictures import (
     PANEL,
@@ -12,6 +14,7 @@ from reference_trainer.evaluation.pictures import (
     dynamics_figure,
     file_names,
     heat_map,
+    save_film,
     save_png,
     side_by_side,
 )
@@ -124,6 +127,32 @@ def test_a_map_has_its_colors_below_it_and_what_they_mean_at_the_ends():
 def test_wrong_arguments(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize("ending", ["mp4", "webp"])
+def test_a_film_of_pictures_whose_labels_grow(tmp_path, monkeypatch, ending):
+    """A title of a picture that says its score is wider at some than at others."""
+    if ending == "mp4":
+        av = pytest.importorskip("av")
+    else:
+        monkeypatch.setitem(sys.modules, "av", None)
+    gray = torch.full((3, 30, 20), 0.5)
+    sheets = [side_by_side([gray], [label]) for label in ("exact CA 9.99e-3", "exact CA 10.01e-3", "n/a")]
+    assert len({sheet.shape for sheet in sheets}) == 3
+    file = save_film(tmp_path, "flight", sheets)
+    assert file.suffix == f".{ending}"
+    if ending == "mp4":
+        with av.open(str(file)) as film:
+            frames = [frame.to_image() for frame in film.decode(video=0)]
+    else:
+        with Image.open(file) as film:
+            frames = [frame.convert("RGB") for frame in ImageSequence.Iterator(film)]
+    widest = sheets[1].shape[2]
+    assert {frame.size for frame in frames} == {(widest // 2 * 2 if ending == "mp4" else widest, 50)}
+    assert len(frames) == 3
+    for frame in frames:  # the picture to the left, beside it nothing
+        assert abs(np.array(frame)[30:45, 2:16].mean() - 128) < 8
+        assert np.array(frame)[30:, 50:].mean() > 245
 
 
 def test_a_label_wider_than_its_picture_is_not_cut():
