@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from itertools import chain, count
@@ -253,10 +253,11 @@ def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split:
     ``view`` is the name of the view's files, see `file_names`.
     """
     panels = [read_image(folder / "views" / split / f"{view}{PANEL}.png")[0] for folder in runs.values()]
-    save_png(path, side_by_side(_of_one_size(panels), [*map(readable, runs)], columns=1))
+    save_png(path, side_by_side([*_of_one_size(panels)], [*map(readable, runs)], columns=1))
 
 
-def _of_one_size(images: Sequence[Tensor]) -> list[Tensor]:
-    """Return pictures (3, H, W) with white margins, where labels, or versions, made some of them smaller."""
+def _of_one_size(images: Sequence[Tensor]) -> Iterator[Tensor]:
+    """Yield pictures (3, H, W) with white margins, where labels, or versions, made some of them smaller."""
     height, width = (max(image.shape[axis] for image in images) for axis in (1, 2))
-    return [pad(image, (0, width - image.shape[2], 0, height - image.shape[1]), value=1.0) for image in images]
+    for image in images:
+        yield pad(image, (0, width - image.shape[2], 0, height - image.shape[1]), value=1.0)
