@@ -45,7 +45,7 @@ class TrainConfig:
     them."""
     guard: int = 0
     """Steps between removals of Gaussians that hang where nobody took a photograph, the last one after the last step;
-    as many as ``iterations``: that alone; 0 never. Only models with a regularizer are guarded."""
+    as many as ``iterations``: that alone; 0 never. Only models with a regularizer are guarded, of two views or more."""
     models: int = 1
     """Models that are trained side by side and compared with each other, 2 for CoR-GS and SE-GS; the first is kept."""
     random_background: bool = False

@@ -168,6 +168,8 @@ def guarding(scene: Scene, config: TrainConfig) -> PlanItem:
     if not config.regularizers:
         reason = "by construction: without dropout or noise the Gaussians of a model need each other"
         return PlanItem("guard", "left out", reason)
+    if len(scene.train) < 2:
+        return PlanItem("guard", "left out", "by construction: no camera is between or beyond a single training view")
     if not config.guard:
         return PlanItem("guard", "left out", "not asked for: --guard 500 removes what hangs where no camera was")
     return PlanItem("guard", "used", f"asked for (guard={config.guard})")

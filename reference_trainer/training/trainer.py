@@ -21,7 +21,6 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.progress import progress_bar
 from reference_trainer.render import NotFiniteError
 from reference_trainer.scenes.scene import Scene
-from reference_trainer.scenes.virtual_cameras import unseen_views
 from reference_trainer.training.assembly import check, make_density, make_losses, make_regularizer, make_renderer
 from reference_trainer.training.checkpoint import load_checkpoint, read_state, save_checkpoint
 from reference_trainer.training.config import TrainConfig
@@ -99,8 +98,8 @@ class Trainer:
             self._refuse_draws_without_multiplier()
         if config.guard and not config.regularizers:
             _log.info("no guard: without dropout or noise the Gaussians of a model need each other.")
-        elif config.guard:
-            unseen_views(scene)  # raises where there can be none
+        elif config.guard and len(scene.train) < 2:
+            _log.info("no guard: there is no camera between or beyond a single training view.")
 
     @property
     def gaussians(self) -> Gaussians:
@@ -280,7 +279,7 @@ class Trainer:
     def _guards(self) -> bool:
         """Whether it is time to remove what hangs where nobody took a photograph."""
         config, step = self.config, self.step
-        if not (config.guard and config.regularizers and self.regularized):
+        if not (config.guard and config.regularizers and self.regularized and len(self.views) > 1):
             return False
         return step == config.iterations or (step > config.densify_from and step % config.guard == 0)
 

@@ -19,6 +19,8 @@ from reference_trainer.scenes.scene import Scene, Viewpoint
 from reference_trainer.scenes.virtual_cameras import unseen_views
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.model_state import initial_gaussians, seen_by_any
+from reference_trainer.training.plan import make_plan
+from reference_trainer.training.recipes import with_recipe
 from reference_trainer.training.trainer import Trainer
 
 OUTSIDE = -1  # the built-in scene's last test view stands beyond its training cameras
@@ -163,6 +165,21 @@ def test_the_guard_of_a_plain_training_is_left_out_and_says_why(scene, said):
     trainer = trained(scene, start, guard=1, iterations=2)
     assert len(trainer.gaussians) == len(start)
     assert any("no guard" in text and "need each other" in text for text in said)
+
+
+def test_a_single_view_trains_at_the_setting_that_the_plan_recommends(scene, said):
+    """It has nothing between or beyond: what the guard looks at is not there."""
+    one = replace(scene, train=scene.train[:1])
+    config = with_recipe("sparse", iterations=3)
+    items = {item.name: item for item in make_plan(one, TrainConfig()).items}
+    assert items["dropout"].decision == "recommended"
+    assert items["dropout"].reason.endswith("--recipe sparse")
+    guarding = {item.name: item for item in make_plan(one, config).items}["guard"]
+    assert (guarding.decision, "single training view" in guarding.reason) == ("left out", True)
+    trainer = Trainer(one, config)
+    trainer.train()
+    assert trainer.step == 3
+    assert any("no guard" in text and "single training view" in text for text in said)
 
 
 def test_cameras_nobody_took_go_around_what_the_training_cameras_look_at():
