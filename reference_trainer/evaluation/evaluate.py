@@ -169,7 +169,7 @@ def evaluate(
     photographs = (view.image.to(model.background.device) for _, _, view in members if isinstance(view, View))
     # Weights may differ under one name: the metric of a photograph and its mirror image tells them apart.
     metric = perceptual and [perceptual.name, *(float(perceptual(x, x.flip(2))) for x in islice(photographs, 1))]
-    store = ResultStore(partial, (model, views, samples, seed, metric, machine()))
+    store = ResultStore(partial, (model, views, samples, seed, metric, machine(model.background.device)))
     done: list[ViewScores] = []
     start, measured = time.perf_counter(), 0
     for number, (split, index, view) in enumerate(members):

@@ -47,13 +47,16 @@ def write_json(path: str | Path, data: object) -> None:
     write_text(path, text)
 
 
-def machine() -> dict[str, str | int]:
-    """Return what a measurement depends on: versions, processor, cores, threads, engine, and the GPU if there is one.
+def machine(device: torch.device | str | None = None) -> dict[str, str | int]:
+    """Return what a measurement on a device depends on: versions, processor, cores, threads, the device, its engine.
+
+    Without a device, the GPU stands for it if there is one, and the engine is that of the processor.
 
     Example:
         >>> sorted(machine())
         ['ca_reg', 'cores', 'cpu', 'device', 'engine', 'kornia', 'platform', 'python', 'threads', 'torch']
     """
+    kind = "cuda" if device is None and torch.cuda.is_available() else torch.device(device or "cpu").type
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -63,8 +66,8 @@ def machine() -> dict[str, str | int]:
         "cpu": _cpu_name(),
         "cores": os.cpu_count() or 0,
         "threads": torch.get_num_threads(),
-        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu",
-        "engine": describe_engine("cpu"),
+        "device": torch.cuda.get_device_name(device) if kind == "cuda" else kind,
+        "engine": describe_engine(device or "cpu"),
     }
 
 

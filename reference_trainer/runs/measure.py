@@ -84,7 +84,7 @@ def measure(
             "ca_settings": asdict(model.ca_score(**shared).settings),
             "background": model.background.tolist(),
             "regularizer": model.regularizer,
-            "machine": machine(),
+            "machine": machine(model.background.device),
         }
         write_json(out / EVALUATION, data)
         table = evaluation_table(data)

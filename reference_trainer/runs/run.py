@@ -356,7 +356,7 @@ def _measure(
         "processor_seconds": trainer.processor_seconds,
         **evaluation.as_dict(),
         "ca_settings": dataclasses.asdict(model.ca_score().settings),
-        "machine": machine(),
+        "machine": machine(trainer.device),
     }
     partial.unlink(missing_ok=True)  # before results.json, because a complete run is not touched again
     write_json(out / RESULTS, results)

@@ -10,6 +10,7 @@ import torch
 
 from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std, print_table
+from reference_trainer.render import describe_engine
 
 NAN = float("nan")
 
@@ -104,6 +105,18 @@ def test_machine_can_be_written(tmp_path):
     assert facts["threads"] == torch.get_num_threads()
     assert facts["cores"] >= 1
     assert facts["cpu"]
+
+
+def test_a_measurement_names_the_device_that_made_it(monkeypatch):
+    """Of two cards, or the processor beside them; what renders on a card needs none to be named."""
+    named = {None: "card 0", "cuda:1": "card 1"}
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device=None: named[device])
+    on_card = machine("cuda:1")
+    assert (on_card["device"], on_card["engine"]) == ("card 1", describe_engine("cuda"))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    on_processor = machine(torch.device("cpu"))
+    assert (on_processor["device"], on_processor["engine"]) == ("cpu", describe_engine("cpu"))
+    assert machine()["device"] == "card 0"
 
 
 def test_decimals_are_the_same_down_a_column():
