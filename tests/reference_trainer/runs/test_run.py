@@ -201,7 +201,7 @@ def with_changes(changes):
     [
         ([], "expected a plan"),
         (with_changes({"no_setting": 0}), "no_setting"),  # of another version
-        (with_changes({"initial_scale": "half"}), "str"),
+        (with_changes({"initial_scale": "half"}), "initial_scale must be a number"),
         (with_changes(3), "int"),
     ],
 )
