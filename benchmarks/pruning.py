@@ -211,7 +211,7 @@ def _score(trainer: Trainer, scene: Scene) -> dict[str, float]:
     for index, view in enumerate(view.to(trainer.device) for view in scene.test):
         image = model.test_rendering(view).image.clamp(0, 1)
         limit = exact(opacities, view)
-        found["psnr"].append(psnr(image, view.image))
+        found["psnr"].append(psnr(image, view.image, view.mask))
         found["ca_exact"].append(limit.value)
         found["covered"].append(limit.visible.double().mean().item())
         found["ca_protocol"].append(protocol(opacities, view, index=index).value)

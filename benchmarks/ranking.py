@@ -87,7 +87,7 @@ def score_view(model: TrainedModel, view: View, *, index: int) -> dict[str, floa
     values["weighted_half"] = _average(exact_half.variance, moments.alpha_mean)
     image = model.test_rendering(view).image.clamp(0, 1)
     return {
-        "psnr": psnr(image, view.image),
+        "psnr": psnr(image, view.image, view.mask),
         **{name: values[name] for name in VARIANTS},
         **{
             f"visible {name}": result.visible.double().mean().item()

@@ -54,6 +54,17 @@ def composites(grays: list[float], behind: float = 0.0) -> list[float]:
     return out
 
 
+def test_quality_is_that_of_the_pixels_that_count():
+    view = black_view(2)
+    mask = torch.tensor([[1.0, 0.0], [0.0, 0.0]])
+    photograph = (1 - mask).expand(3, 2, 2)  # right where it counts, as the wall is black, and wrong elsewhere
+    found = score_view(
+        model_of_layers([0.1, 0.1], 100.0), dataclasses.replace(view, image=photograph, mask=mask), index=0
+    )
+    gray = 0.1 * (1 - (1 - OPACITY) ** 2)
+    assert found["psnr"] == pytest.approx(-20 * math.log10(gray), abs=0.1)
+
+
 @pytest.fixture(scope="module")
 def walls() -> dict[str, tuple[list[float], list[dict[str, float]]]]:
     """Two models of three layers that fill the view: equal ones, whose holes show black, and unequal darker ones."""
