@@ -214,9 +214,10 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
     merit = "highest PSNR" if split == "test" else "least co-adaptation"
     last = said[best].rpartition(" and ")[2]
     than = "from" if "told apart" in last else "as" if last.startswith("the same") else "than"
-    text = f"{rest[best].name}{f' (the {merit} of {len(rest)})' * (len(rest) > 1)}: {said[best]} {than} "
+    text = f"{rest[best].name}{f' (the {merit} of {len(rest)})' * (len(rest) > 1)}: "
+    text += f"{said[best]} {than} " if said[best] else "no score in common with "
     text += f"{reference.name if not reference.baseline else 'the baseline'} {where}."
-    evidence = [f"{rows.name}: {said[i]}." for i, rows in enumerate(rest) if i != best]
+    evidence = [f"{rows.name}: {said[i] or 'no score in common'}." for i, rows in enumerate(rest) if i != best]
     seeds = {len(rows.results) for rows in strategies}
     if min(seeds) > 1:
         evidence.append(
@@ -231,7 +232,7 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
 
 
 def _said(rows: Rows, reference: Rows, split: str) -> str:
-    """Return how a strategy differs from the reference in PSNR and co-adaptation."""
+    """Return how a strategy differs from the reference in PSNR and co-adaptation; "" if they share no score."""
     parts = []
     if split == "test" and (found := _difference(rows, reference, split, "psnr")):
         delta, margin = found
@@ -248,4 +249,4 @@ def _said(rows: Rows, reference: Rows, split: str) -> str:
         part += " more" if delta > 0 else " less"
         text = f"{part} co-adaptation" if float(part.split()[0].removesuffix("e-3")) else "the same co-adaptation"
         parts.append(text if not abs(delta) <= margin else f"a co-adaptation that cannot be told apart ({part})")
-    return " and ".join(parts) or "nothing measured that is different"
+    return " and ".join(parts)

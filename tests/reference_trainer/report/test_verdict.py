@@ -108,7 +108,8 @@ def test_what_has_no_score_is_not_the_best():
     strategies = [rows(name, [30.0], [ca], split="around") for name, ca in (("A", 4e-3), ("B", math.nan), ("C", 2e-3))]
     found, evidence = verdict(strategies)
     assert found.startswith("C (the least co-adaptation of 2): 50 % less co-adaptation than A")
-    assert evidence[0] == "B: nothing measured that is different."
+    assert evidence[0] == "B: no score in common."
+    assert verdict(strategies[1:])[0] == "C: no score in common with B around the training views."
 
 
 def test_the_best_and_the_better_are_marked_where_that_is_a_merit():
