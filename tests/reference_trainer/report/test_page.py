@@ -285,9 +285,6 @@ def test_text_from_files_cannot_end_the_data(run, found, tmp_path, monkeypatch):
     assert page.data["runs"][0]["label"] == bad
 
 
-# In a browser.
-
-
 @pytest.mark.slow
 def test_no_file_but_a_report_is_overwritten(run, tmp_path):
     (tmp_path / "thesis.html").write_text("<!doctype html>precious")
