@@ -212,12 +212,11 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
     measured = [i for i, rows in enumerate(rest) if rows.values(split, key)] or [0]
     best = max(measured, key=lambda i: sign * mean_std(rest[i].values(split, key))[0])
     merit = "highest PSNR" if split == "test" else "least co-adaptation"
-    last = said[best].rpartition(" and ")[2]
-    than = "from" if "told apart" in last else "as" if last.startswith("the same") else "than"
+    differs, than = said[best]
     text = f"{rest[best].name}{f' (the {merit} of {len(rest)})' * (len(rest) > 1)}: "
-    text += f"{said[best]} {than} " if said[best] else "no score in common with "
+    text += f"{differs} {than} " if differs else "no score in common with "
     text += f"{reference.name if not reference.baseline else 'the baseline'} {where}."
-    evidence = [f"{rows.name}: {said[i] or 'no score in common'}." for i, rows in enumerate(rest) if i != best]
+    evidence = [f"{rows.name}: {said[i][0] or 'no score in common'}." for i, rows in enumerate(rest) if i != best]
     seeds = {len(rows.results) for rows in strategies}
     if min(seeds) > 1:
         evidence.append(
@@ -231,22 +230,27 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
     return text, evidence + limits
 
 
-def _said(rows: Rows, reference: Rows, split: str) -> str:
-    """Return how a strategy differs from the reference in PSNR and co-adaptation; "" if they share no score."""
+def _said(rows: Rows, reference: Rows, split: str) -> tuple[str, str]:
+    """Return how a strategy differs from the reference in PSNR and co-adaptation, and what leads to the latter's name.
+
+    Both are empty if the two share no score.
+    """
     parts = []
     if split == "test" and (found := _difference(rows, reference, split, "psnr")):
         delta, margin = found
-        text = (
-            f"{abs(delta):.2f} dB {'higher' if delta > 0 else 'lower'} PSNR"
-            if f"{abs(delta):.2f}" != "0.00"
-            else "the same PSNR"
-        )
-        parts.append(text if not abs(delta) <= margin else f"a PSNR that cannot be told apart ({delta:+.2f} dB)")
+        size = f"{abs(delta):.2f}"
+        parts.append(_part("PSNR", size, f" dB {'higher' if delta > 0 else 'lower'}", told=not abs(delta) <= margin))
     if found := _difference(rows, reference, split, "ca_exact_half"):
         delta, margin = found
         usual = mean_std(reference.values(split, "ca_exact_half"))[0]
-        part = f"{abs(delta) / usual:.0%}".replace("%", " %") if usual else f"{abs(delta) * 1e3:.2f}e-3"
-        part += " more" if delta > 0 else " less"
-        text = f"{part} co-adaptation" if float(part.split()[0].removesuffix("e-3")) else "the same co-adaptation"
-        parts.append(text if not abs(delta) <= margin else f"a co-adaptation that cannot be told apart ({part})")
-    return " and ".join(parts)
+        size, unit = (f"{100 * abs(delta) / usual:.0f}", " %") if usual else (f"{abs(delta) * 1e3:.2f}", "e-3")
+        how = f"{unit} {'more' if delta > 0 else 'less'}"
+        parts.append(_part("co-adaptation", size, how, told=not abs(delta) <= margin))
+    return " and ".join(text for text, _ in parts), parts[-1][1] if parts else ""
+
+
+def _part(score: str, size: str, how: str, *, told: bool) -> tuple[str, str]:
+    """Return a difference in one score, and the word that follows it; ``told`` says whether it can be told."""
+    if not told:
+        return f"a {score} that cannot be told apart ({size}{how})", "from"
+    return (f"{size}{how} {score}", "than") if float(size) else (f"the same {score}", "as")

@@ -325,7 +325,7 @@ def test_the_scores_of_a_comparison_are_those_of_all_its_seeds(run, tmp_path):
     assert [cell["text"] for cell in cells] == ["19.50 ± 0.71", "21.00 ± 1.41"]
     assert (cells[1]["delta"], cells[1]["better"], cells[1]["best"], cells[0]["best"]) == ("+1.50", True, True, False)
     # Two standard errors are 2 sqrt(0.5 / 2 + 2 / 2) = 2.24.
-    assert data["verdict"].startswith("Dropout 0.2: a PSNR that cannot be told apart (+1.50 dB) and ")
+    assert data["verdict"].startswith("Dropout 0.2: a PSNR that cannot be told apart (1.50 dB higher) and ")
 
 
 def trained(folder: Path, seed: int, psnr: float, *, test=("test_0",), **settings) -> Path:

@@ -74,7 +74,7 @@ def test_what_is_within_two_standard_errors_is_not_told_apart():
         assert (2 * half * math.sqrt(2) < 1) == apart
         found, evidence = verdict([rows("A", psnr[0], [0.004] * 2), rows("B", psnr[1], [0.001] * 2)])
         assert ("1.00 dB higher PSNR" in found) == apart
-        assert ("a PSNR that cannot be told apart (+1.00 dB)" in found) != apart
+        assert ("a PSNR that cannot be told apart (1.00 dB higher)" in found) != apart
         assert "75 % less co-adaptation than A" in found
         assert evidence[0].startswith("2 seeds each. Two means are told apart")
 
