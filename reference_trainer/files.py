@@ -52,9 +52,12 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write text as UTF-8, atomically as `replacing` does."""
+    """Write text as UTF-8, atomically as `replacing` does.
+
+    Bytes of a file name that are no text become escapes, in JSON its own: names of old archives are not all UTF-8.
+    """
     with replacing(path) as place:
-        place.write_text(text, encoding="utf-8")
+        place.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def remove_leftovers(folder: str | Path, *, below: bool = True) -> None:

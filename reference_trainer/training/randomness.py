@@ -22,7 +22,8 @@ def stream(seed: int, step: int, purpose: str, device: torch.device | str = "cpu
         True
     """
     # Hashed, so that streams of neighboring seeds and steps have nothing in common.
-    words = np.random.SeedSequence([seed, step, *purpose.encode()]).generate_state(2, np.uint32)
+    letters = purpose.encode(errors="surrogatepass")  # it may hold the name of a file, which need not be UTF-8
+    words = np.random.SeedSequence([seed, step, *letters]).generate_state(2, np.uint32)
     return torch.Generator(device=device).manual_seed(int(words[0]) << 32 | int(words[1]))
 
 

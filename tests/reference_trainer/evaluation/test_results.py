@@ -22,6 +22,13 @@ def test_json_round_trip(tmp_path):
     assert [entry.name for entry in (tmp_path / "new").iterdir()] == ["a.json"]
 
 
+def test_json_holds_the_name_of_any_file(tmp_path):
+    """Linux takes any bytes, and old archives have names in Latin-1: a training on one ended here, without results."""
+    name = b"caf\xe9 \xc3\xa9.jpg".decode(errors="surrogateescape")
+    write_json(tmp_path / "a.json", {name: [name]})
+    assert json.loads((tmp_path / "a.json").read_text(encoding="utf-8")) == {name: [name]}
+
+
 def test_json_without_numbers_that_it_cannot_hold(tmp_path):
     write_json(tmp_path / "a.json", {"a": NAN, "b": [math.inf, {"c": -math.inf}], "d": (np.float64("nan"), 1)})
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": None, "b": [None, {"c": None}], "d": [None, 1]}

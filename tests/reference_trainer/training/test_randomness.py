@@ -57,6 +57,13 @@ def test_every_epoch_sees_every_view_in_an_order_of_its_own():
     assert epochs != [tuple(view_order(4, 5 * epoch + i, 5) for i in range(5)) for epoch in range(40)]
 
 
+def test_views_whose_names_are_not_utf_8_have_streams_of_their_own():
+    """As files of old archives: the term ``views`` draws by the names of photographs."""
+    names = [name.decode(errors="surrogateescape") for name in (b"\xe9.jpg", b"\xe8.jpg", b"e.jpg")]
+    draws = [torch.rand(3, generator=stream(0, 1, f"{name}/regularizer")) for name in names]
+    assert len({tuple(draw.tolist()) for draw in draws}) == 3
+
+
 def test_one_thread_and_afterwards_as_before():
     torch.set_num_threads(2)
     try:
