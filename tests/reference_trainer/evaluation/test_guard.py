@@ -3,6 +3,7 @@
 import math
 import weakref
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.scene import Scene, Viewpoint
-from reference_trainer.scenes.virtual_cameras import unseen_views
+from reference_trainer.scenes.virtual_cameras import MOST_UNSEEN, unseen_views
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.model_state import initial_gaussians, seen_by_any
 from reference_trainer.training.plan import make_plan
@@ -199,6 +200,21 @@ def test_cameras_nobody_took_go_around_what_the_training_cameras_look_at():
     for view in views:
         torch.testing.assert_close(view.camera.position.norm(), torch.tensor(5.0), rtol=1e-4, atol=0)
         torch.testing.assert_close(view.camera.forward, -view.camera.position / 5, rtol=0, atol=1e-4)
+
+
+def test_many_photographs_have_no_more_cameras_nobody_took_than_a_guard_can_look_at():
+    scene = synthetic_scene(width=32, height=24, points=50)
+    row = []
+    for i in range(40):
+        pose = scene.train[0].camera.world_to_camera.clone()
+        pose[0, 3] += 0.1 * i
+        row.append(replace(scene.train[0], name=str(i), camera=replace(scene.train[0].camera, world_to_camera=pose)))
+    names = [view.name for view in unseen_views(replace(scene, train=tuple(row)))]
+    assert len(set(names)) == len(names) == MOST_UNSEEN
+    places = {kind: [int(name.split()[1].strip(",")) for name in names if name.startswith(kind)]
+              for kind in ("between", "beyond")}  # fmt: skip
+    for of in places.values():
+        assert max(b - a for a, b in pairwise([0, *sorted(of), 39])) <= 4  # everywhere along the row
 
 
 def test_nothing_but_the_veil_goes(scene):
