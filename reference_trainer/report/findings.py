@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -174,7 +175,8 @@ def pictures_of(
     found, said = {"render": image_uri(image)}, []
     if isinstance(view, View):
         found["error"] = heat_uri(error_picture(image, view.image))
-        said.append(f"PSNR {psnr(image, view.image, view.mask):.2f} dB")
+        if not math.isnan(measured := psnr(image, view.image, view.mask)):  # its mask may leave no pixel
+            said.append(f"PSNR {measured:.2f} dB")
     if expected is not None:
         half = avg_pool2d(expected.error[None], 2, ceil_mode=True)[0]  # it is smooth, and a third of the size
         found["expected error"] = heat_uri(expected_error_picture(expected._replace(error=half)))
