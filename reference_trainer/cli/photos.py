@@ -21,6 +21,7 @@ from reference_trainer.json_files import read_json
 from reference_trainer.runs.folder import (
     BAKED_PLY,
     CHECKPOINT,
+    COMPARISON,
     CONFIG,
     PLAN,
     PLY,
@@ -110,7 +111,7 @@ class Run:
         if self.folder.resolve() in self.photos.resolve().parents:
             raise ValueError(f"the photographs are in {self.folder}, to which nothing is written: give another --out.")
         ours = (self.folder / MARK).exists()
-        check_output(self.folder, self.photos, () if ours else (SCENE, CONFIG, CHECKPOINT, PLY, RESULTS, VIEWS))
+        check_output(self.folder, self.photos, () if ours else (SCENE, CONFIG, CHECKPOINT, PLY, RESULTS, VIEWS, COMPARISON))
         report_file([self.folder])
 
     def __call__(self) -> None:

@@ -15,7 +15,7 @@ from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.evaluation.tables import comparison_table
 from reference_trainer.files import write_text
 from reference_trainer.runs.executors import Failure
-from reference_trainer.runs.folder import COMPARISON, RESULTS, check_output, folder_name
+from reference_trainer.runs.folder import COMPARISON, CONFIG, RESULTS, check_output, folder_name, settings_of_run
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
@@ -107,10 +107,15 @@ def compare(
     folder, the results of the finished runs and the failures of the others; both are also written there.
 
     Raises:
-        ValueError: if there is nothing to run, a scene lacks what a term of the loss needs, or a folder holds a table
-            or a figure of somebody else's.
+        ValueError: if there is nothing to run, a scene lacks what a term of the loss needs, a folder holds a table or a
+            figure of somebody else's, or a run itself, or one of the runs was begun with other settings.
     """
     for folder, options in scenes.items():
+        if (folder / CONFIG).exists():
+            raise ValueError(
+                f"{folder} holds a run itself ({CONFIG}), which a report would show in place of a comparison: give "
+                "another --out."
+            )
         check_output(folder, options.path, () if (folder / COMPARISON).exists() else (TABLE, "dynamics.png"))
     if not scenes or not configs or not seeds:
         raise ValueError(
@@ -126,6 +131,8 @@ def compare(
         )
         for folder, name, seed in grid
     ]
+    for run in runs:  # before any failure of these runs could take the place of their results in the file
+        settings_of_run(run.out, run.options, run.config, auto=False, given=())
     terms = [term for config in configs.values() for term in make_losses(config)]
     if looking := [term for term in terms if type(term).begin is not LossTerm.begin]:
         for options in {run.options for run in runs if not (run.out / RESULTS).exists()}:

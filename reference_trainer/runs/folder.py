@@ -88,13 +88,13 @@ def settings_of_run(
 
     Raises:
         ValueError: if the folder holds a run with other settings, a checkpoint without settings, or a damaged file;
-            or no run, but files that a run would overwrite, or the photographs.
+            or no run, but files that a run would overwrite, a comparison, or the photographs.
     """
     trained = (out / CHECKPOINT).exists()  # looked for first: another process writes it last
     if not (out / CONFIG).exists():
         if trained:
             raise ValueError(f"{out} holds a {CHECKPOINT} but no {CONFIG}: give another folder, or delete this one.")
-        check_output(out, options.path, (PLY, BAKED_PLY, RESULTS, VIEWS))
+        check_output(out, options.path, (PLY, BAKED_PLY, RESULTS, VIEWS, COMPARISON))
         return None
     if auto and (out / PLAN).exists():
         from reference_trainer.training.plan import Plan  # needs torch

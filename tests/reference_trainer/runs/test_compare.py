@@ -33,7 +33,7 @@ from reference_trainer.runs.compare import (
     strategies,
 )
 from reference_trainer.runs.executors import Failure, choose_executor
-from reference_trainer.runs.folder import RESULTS
+from reference_trainer.runs.folder import RESULTS, run_settings
 from reference_trainer.runs.grid import Running
 from reference_trainer.runs.measure import render_run
 from reference_trainer.runs.run import Monitoring, run_experiment
@@ -165,6 +165,21 @@ def test_what_a_scene_lacks_is_said_once_before_any_run(changes, lacking, tmp_pa
     with pytest.raises(ValueError, match=lacking):
         compare({tmp_path: SceneOptions()}, {"a": TrainConfig(**changes)}, [0, 1], Running(engine))
     assert engine.tasks == []
+
+
+def test_a_comparison_is_not_made_in_the_folder_of_a_run(tmp_path):
+    """Its page, and every other report on the folder, would show that run alone."""
+    write_json(tmp_path / "config.json", run_settings(SceneOptions(), TrainConfig()))
+    with pytest.raises(ValueError, match=r"holds a run itself .* give another --out"):
+        compare({tmp_path: SceneOptions()}, {"a": TrainConfig()}, [0], Running(Here()))
+
+
+def test_other_settings_leave_a_finished_comparison_as_it_is(tmp_path):
+    write_json(tmp_path / "a/seed_0/config.json", run_settings(SceneOptions(), TrainConfig()))
+    (tmp_path / COMPARISON).write_text("the results")
+    with pytest.raises(ValueError, match=r"seed_0 holds a run with other settings \(dropout: 0.0 -> 0.3\)"):
+        compare({tmp_path: SceneOptions()}, {"a": TrainConfig(dropout=0.3)}, [0, 1], Running(Here()))
+    assert (tmp_path / COMPARISON).read_text() == "the results"
 
 
 def test_failed_runs_are_listed_at_the_end(tmp_path, said):

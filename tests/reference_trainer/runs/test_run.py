@@ -13,7 +13,7 @@ from ca_reg.monitor import LOG_NAME
 from reference_trainer.evaluation.tables import evaluation_table, summary
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import run as run_module
-from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, CONFIG, PLAN, PLY, RESULTS, read_results
+from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, COMPARISON, CONFIG, PLAN, PLY, RESULTS, read_results
 from reference_trainer.runs.run import Monitoring, load_run, model_of, run_experiment
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
@@ -289,7 +289,7 @@ def test_the_log_and_tensorboard_hold_the_score_of_the_tables(finished):
     assert "CA (5 renders, drop rate 0.6) (1e-3)" in evaluation_table(results)
 
 
-@pytest.mark.parametrize("name", [PLY, RESULTS, "views"])
+@pytest.mark.parametrize("name", [PLY, RESULTS, COMPARISON, "views"])
 def test_a_folder_of_somebody_elses_is_not_written_to(name, options, short, tmp_path):
     (tmp_path / name).mkdir() if name == "views" else (tmp_path / name).write_text("precious")
     if name == RESULTS:  # without the settings of a run it is nobody's
