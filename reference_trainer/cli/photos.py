@@ -110,8 +110,8 @@ class Run:
             raise ValueError(f"expected at least 2 --frames of a video, got {self.frames}.")
         if self.folder.resolve() in self.photos.resolve().parents:
             raise ValueError(f"the photographs are in {self.folder}, to which nothing is written: give another --out.")
-        ours = (self.folder / MARK).exists()
-        check_output(self.folder, self.photos, () if ours else (SCENE, CONFIG, CHECKPOINT, PLY, RESULTS, VIEWS, COMPARISON))
+        others = (SCENE, CONFIG, CHECKPOINT, PLY, RESULTS, VIEWS, COMPARISON)
+        check_output(self.folder, self.photos, () if (self.folder / MARK).exists() else others)
         report_file([self.folder])
 
     def __call__(self) -> None:
