@@ -160,6 +160,8 @@ class Run:
                     f"{self.folder} was made from other photographs, see {', '.join(sorted(changed))}: give another "
                     "--out, or begin again with --from photographs."
                 )
+            elif scene != self.photos:  # where they were put, by the name that the photographs had then
+                scene = next((images.parent for images in (self.folder / SCENE).glob("*/images")), scene)
             self._begin_again("poses", "train")
         return scene
 

@@ -136,6 +136,12 @@ def test_an_interrupted_run_goes_on(garden, tmp_path, monkeypatch, capsys):
     new = {path.name for path, at in seen(out).items() if trained.get(path) != at}
     assert new == {"report.html"}
 
+    # The photographs may have moved meanwhile.
+    finished = seen(out)
+    garden.rename(tmp_path / "yard")
+    main(["run", "yard", "--out", "out", "--no-open"])
+    assert seen(out) == finished
+
 
 @pytest.mark.slow
 def test_photographs_with_cameras_stay_where_they_are(garden, tmp_path, monkeypatch):
