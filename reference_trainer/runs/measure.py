@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -117,10 +118,10 @@ def render_run(
     """Render a run with its test-time opacities; return the folder of the pictures, ``<run>/render_<what>`` by default.
 
     ``what`` is ``"test"``, ``"train"``, ``"flight"`` through the training cameras in so many ``frames``, which is also
-    written as a film (`save_film`), or ``"auto"``: the test views, or if there is none the training views. ``"error"``
-    adds a heat map of the expected error to each test view, or if there is none, to views between and around the
-    training cameras, and with ``mask`` a third picture, white where the expected error is above that. ``trust`` is as
-    for `load_run`.
+    written as a film (`save_film`) and takes the place of an earlier flight, or ``"auto"``: the test views, or if there
+    is none the training views. ``"error"`` adds a heat map of the expected error to each test view, or if there is
+    none, to views between and around the training cameras, and with ``mask`` a third picture, white where the expected
+    error is above that. ``trust`` is as for `load_run`.
 
     Raises:
         ValueError: if there is no test view to render, or a picture of somebody else's would be overwritten.
@@ -159,5 +160,9 @@ def render_run(
                 save_png(folder / f"{name}_mask.png", (found.error > mask).float().cpu().expand(3, -1, -1))
     if what == "flight":
         _log.info("The film is %s", save_film(folder, "flight", images))
+        for number in count(len(views)):  # of an earlier, longer flight, which would go on where this one ends
+            if not (left := folder / f"{number:04d}.png").exists() or not is_own_png(left):
+                break
+            left.unlink()
     _log.info("%d pictures are in %s", len(files), folder)
     return folder

@@ -211,6 +211,9 @@ def test_a_flight_begins_and_ends_at_training_cameras(suffix, run, tmp_path, sai
         one, other = (read_image(path)[0] for path in (folder / f"{frame}.png", out / f"views/train/{view}.png"))
         assert (one - other).abs().max() <= 1 / 255 + 1e-6
     assert said == [f"The film is {film}", f"5 pictures are in {folder}"]
+    (folder / "0006.png").write_bytes(b"somebody else's")
+    render_run(out, "flight", folder, frames=4)  # nothing is left of the longer one
+    assert sorted(folder.iterdir()) == [*pictures[:4], folder / "0006.png", film]
 
 
 def test_where_a_run_is_expected_to_be_wrong(run, tmp_path):
