@@ -194,13 +194,18 @@ def load_run(folder: Path, device: torch.device | str = "cpu", *, trust: Collect
     name as module:Class would be executed here.
 
     Raises:
-        FileNotFoundError: if the folder holds no run.
+        FileNotFoundError: if the folder holds no run, or its scene is not where it was.
         ValueError: if its settings or its checkpoint are damaged, do not belong together, or name other modules.
     """
     check_run(folder)
     options, config = read_run_settings(folder / CONFIG)
     for settings in (options, config):
         check_trusted(folder, settings, trust)
+    if options.path != "synthetic" and not Path(options.path).exists():
+        raise FileNotFoundError(
+            f"{folder} was trained on {options.path}, which is not there anymore: put the scene back, or write its new "
+            f'place as "path" into {folder / CONFIG}.'
+        )
     return _load(folder, load_scene(options, seed=config.seed), device, trust)
 
 

@@ -402,6 +402,20 @@ def test_a_run_can_be_loaded(finished):
     assert len(model.gaussians) == results["gaussians"]
 
 
+def test_a_run_whose_scene_has_moved_says_how_it_is_found_again(finished, tmp_path):
+    """Two files are the run: the settings, with the place of the scene, and the checkpoint."""
+    for name in (CONFIG, CHECKPOINT):
+        shutil.copy(finished[0] / name, tmp_path)
+    settings = json.loads((tmp_path / CONFIG).read_text())
+    before, settings["scene"]["path"] = settings["scene"]["path"], str(tmp_path / "gone")
+    (tmp_path / CONFIG).write_text(json.dumps(settings))
+    with pytest.raises(FileNotFoundError, match=r'trained on .*gone, .* not there .* "path" into .*config\.json'):
+        load_run(tmp_path)
+    settings["scene"]["path"] = before
+    (tmp_path / CONFIG).write_text(json.dumps(settings))
+    assert load_run(tmp_path).step == 11
+
+
 def test_inverted_dropout_needs_nothing_at_test_time(tiny_scene):
     model = model_of(Trainer(tiny_scene, TrainConfig(regularizer="dropout(0.2, compensate=True)")))
     assert (model.dropout, model.factor) == (0.0, 1.0)
