@@ -15,7 +15,7 @@ from ca_reg.regularizers import parse
 from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.evaluate import Evaluation, evaluate, expected_error_picture
 from reference_trainer.evaluation.lpips import LPIPS
-from reference_trainer.evaluation.pictures import file_names, is_own_png, save_film, save_png
+from reference_trainer.evaluation.pictures import PANEL, file_names, is_own_png, save_film, save_png
 from reference_trainer.evaluation.results import PARTIAL, machine, write_json
 from reference_trainer.evaluation.shares import guard
 from reference_trainer.evaluation.tables import evaluation_table
@@ -88,12 +88,24 @@ def measure(
             "machine": machine(model.background.device),
         }
         write_json(out / EVALUATION, data)
+        _remove_other_pictures(out / VIEWS, views)
         table = evaluation_table(data)
         write_text(out / "evaluation.md", table + "\n")
         partial.unlink(missing_ok=True)
     _log.info(table)
     _log.info("Scores and pictures are in %s", out)
     return result
+
+
+def _remove_other_pictures(folder: Path, views: Mapping[str, Sequence[Viewpoint]]) -> None:
+    """Remove the pictures of an earlier measurement at other views, which have no scores beside them."""
+    named = {split: file_names([view.name for view in group]) for split, group in views.items()}
+    shown = {folder / split / f"{name}{end}.png" for split, of in named.items() for name in of for end in ("", PANEL)}
+    for path in {*folder.glob("*/*.png")} - shown:
+        if is_own_png(path):
+            path.unlink()
+    for split in {path for path in folder.iterdir() if path.is_dir() and not any(path.iterdir())}:
+        split.rmdir()
 
 
 def log_what_hangs(model: TrainedModel, scene: Scene | None) -> None:

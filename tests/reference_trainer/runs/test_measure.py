@@ -86,6 +86,15 @@ def test_measuring_a_run_again_gives_what_the_run_found(run, tmp_path, said):
     assert any("| mean test |" in text for text in said)
 
 
+def test_pictures_of_other_views_do_not_stay_beside_the_scores(run, tmp_path):
+    model, scene = load_run_model(run[0])
+    measure(model, {"train": scene.train[:1], "test": scene.test[:2]}, tmp_path, about={}, samples=2)
+    (tmp_path / "views" / "test" / "mine.png").write_bytes(b"somebody else's")
+    measure(model, {"test": scene.test[1:2]}, tmp_path, about={}, samples=2)
+    found = {path.relative_to(tmp_path / "views").as_posix() for path in (tmp_path / "views").rglob("*")}
+    assert found == {"test", "test/mine.png", "test/test_1.png", "test/test_1_panel.png"}
+
+
 def test_the_folder_is_locked_until_the_last_file_has_changed(run, tmp_path, monkeypatch):
     """Otherwise a second evaluation that begins in between would lose its partial scores to the first."""
     model, scene = load_run_model(run[0])
