@@ -203,8 +203,8 @@ def load_run(folder: Path, device: torch.device | str = "cpu", *, trust: Collect
         check_trusted(folder, settings, trust)
     if options.path != "synthetic" and not Path(options.path).exists():
         raise FileNotFoundError(
-            f"{folder} was trained on {options.path}, which is not there anymore: put the scene back, or write its new "
-            f'place as "path" into {folder / CONFIG}.'
+            f"{folder} was trained on {options.path}, which is not there anymore: put the scene back, or write where "
+            f'it is now, under the same name, as "path" into {folder / CONFIG}.'
         )
     return _load(folder, load_scene(options, seed=config.seed), device, trust)
 
