@@ -15,7 +15,15 @@ from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.evaluation.tables import comparison_table
 from reference_trainer.files import write_text
 from reference_trainer.runs.executors import Failure
-from reference_trainer.runs.folder import COMPARISON, CONFIG, RESULTS, check_output, folder_name, settings_of_run
+from reference_trainer.runs.folder import (
+    COMPARISON,
+    CONFIG,
+    RESULTS,
+    check_output,
+    folder_name,
+    report_file,
+    settings_of_run,
+)  # fmt: skip
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
@@ -107,8 +115,8 @@ def compare(
     folder, the results of the finished runs and the failures of the others; both are also written there.
 
     Raises:
-        ValueError: if there is nothing to run, a scene lacks what a term of the loss needs, a folder holds a table or a
-            figure of somebody else's, or a run itself, or one of the runs was begun with other settings.
+        ValueError: if there is nothing to run, a scene lacks what a term of the loss needs, a folder holds a table, a
+            figure or a page of somebody else's, or a run itself, or one of the runs was begun with other settings.
     """
     for folder, options in scenes.items():
         if (folder / CONFIG).exists():
@@ -116,6 +124,7 @@ def compare(
                 f"{folder} holds a run itself ({CONFIG}), which a report would show in place of a comparison: give "
                 "another --out."
             )
+        report_file([folder])
         check_output(folder, options.path, () if (folder / COMPARISON).exists() else (TABLE, "dynamics.png"))
     if not scenes or not configs or not seeds:
         raise ValueError(

@@ -148,6 +148,8 @@ def check_run(folder: Path) -> None:
             found += ", which the program that wrote this checkpoint can export"
     elif inside := [path for path in runs_of(folder) if path != folder]:
         found = f"{folder} holds no run itself, but {len(inside)} below it: give one, such as {inside[0]}"
+    elif scenes := sorted(path.parent for path in folder.glob(f"*/{COMPARISON}")):
+        found = f"{folder} holds the comparisons of {len(scenes)} scenes: give that of one, such as {scenes[0]}"
     raise FileNotFoundError(f"{found}.")
 
 

@@ -33,7 +33,7 @@ from reference_trainer.runs.compare import (
     strategies,
 )
 from reference_trainer.runs.executors import Failure, choose_executor
-from reference_trainer.runs.folder import RESULTS, run_settings
+from reference_trainer.runs.folder import RESULTS, check_run, run_settings
 from reference_trainer.runs.grid import Running
 from reference_trainer.runs.measure import render_run
 from reference_trainer.runs.run import Monitoring, run_experiment
@@ -172,6 +172,22 @@ def test_a_comparison_is_not_made_in_the_folder_of_a_run(tmp_path):
     write_json(tmp_path / "config.json", run_settings(SceneOptions(), TrainConfig()))
     with pytest.raises(ValueError, match=r"holds a run itself .* give another --out"):
         compare({tmp_path: SceneOptions()}, {"a": TrainConfig()}, [0], Running(Here()))
+
+
+def test_somebody_elses_page_is_noticed_before_the_training(tmp_path):
+    (tmp_path / "report.html").write_text("precious")
+    engine = Here()
+    with pytest.raises(ValueError, match=r"no report of ca-reg and is not overwritten"):
+        compare({tmp_path: SceneOptions()}, {"a": TrainConfig(iterations=1)}, [0], Running(engine))
+    assert engine.tasks == []
+
+
+def test_the_folder_of_several_comparisons_says_so(tmp_path):
+    for scene in ("fern", "lego"):
+        write_json(tmp_path / scene / COMPARISON, {"runs": {}})
+        write_json(tmp_path / scene / "baseline/seed_0/config.json", run_settings(SceneOptions(), TrainConfig()))
+    with pytest.raises(FileNotFoundError, match=r"comparisons of 2 scenes: give that of one, such as .*fern"):
+        check_run(tmp_path)
 
 
 def test_other_settings_leave_a_finished_comparison_as_it_is(tmp_path):
