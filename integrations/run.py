@@ -90,6 +90,9 @@ def resume(arguments: Sequence[str], script: Sequence[str]) -> None:
     """
     own = Path(sys.argv[0])
     this = [str(own)] if own.suffix == ".py" and own.is_file() else script
+    undo = ExitStack()
+    undo.enter_context(old_aliases())
+    atexit.register(undo.close)  # holds them until the end
     hook: Hook = _parse([*arguments, *this], in_child=True).hook
     hook.install()
     folder = folder_of_reports()

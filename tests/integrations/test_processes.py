@@ -144,8 +144,25 @@ def test_a_download_of_the_scripts_own_is_explained(repository, tmp_path, capsys
     assert (str(model) in problem) == saves
 
 
+OLD = """
+import torch, matplotlib.cm, numpy as np
+assert np.zeros(2, np.int).dtype == int and np.float is float
+assert len(matplotlib.cm.get_cmap('viridis', 7).colors) == 7
+"""
+
+
 def test_old_names_of_libraries_are_there_for_a_script(repository):
-    text = "import matplotlib.cm, numpy as np\nassert np.zeros(2, np.int).dtype == int and np.float is float\n"
-    (repository / "old.py").write_text(text + "assert len(matplotlib.cm.get_cmap('viridis', 7).colors) == 7\n")
+    (repository / "old.py").write_text(OLD)
     main([str(repository / "old.py")])
+
+
+@pytest.mark.slow
+def test_old_names_of_libraries_are_there_for_scripts_that_a_script_starts(repository):
+    text = (repository / "train.py").read_text()
+    (repository / "train.py").write_text(OLD + text)
+    start = 'import subprocess, sys\nsubprocess.run([sys.executable, "train.py", "2"], check=True)\n'
+    (repository / "both.py").write_text(start)
+    done = run("--dropout", 0.5, "both.py", cwd=repository)
+    assert done.returncode == 0, done.stderr
+    assert "train.py, a process that it started: 2 renders regularized" in done.stderr
     assert not {"int", "float"} & set(vars(np))
