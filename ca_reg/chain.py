@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ca_reg.functional import Multiplier
 from ca_reg.regularizer import Draw, Learned, Params, Regularizer
+from ca_reg.schedules import Scheduled
 
 __all__ = ["Chain", "WrappedModule"]
 
@@ -82,6 +83,15 @@ class Chain(Regularizer):
         super().set_step(step)
         for member in self:
             member.set_step(step)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        # The chain and its members of constant rate save no step; at one that was set before, later than the saved one,
+        # they would keep the others from going back.
+        scheduled = [name for name, part in self.named_modules() if isinstance(part, Scheduled)]
+        saved = [state_dict[key] for name in scheduled if (key := f"{prefix}{name}.step") in state_dict]
+        if saved:
+            self.set_step(max(round(float(step)) for step in saved))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def regularize(self, x: Params, generator: torch.Generator | None = None) -> Params:
         """Let every member draw in turn, each given the output of the one before."""

@@ -107,6 +107,20 @@ def test_a_moving_average_over_the_values_of_a_state(make, rate):
     assert average[1].step == (0 if rate == 0.2 else 12)  # (0 / 2 + 10 / 2) / 2 + 20 / 2, to the nearest even
 
 
+@pytest.mark.parametrize("wrap", [Chain, lambda *parts: nn.Sequential(Chain(*parts))], ids=["alone", "within"])
+@pytest.mark.parametrize("rate", [0.2, RAMP], ids=["constant", "schedule"])
+def test_a_chain_goes_back_to_the_step_of_an_earlier_checkpoint(wrap, rate):
+    module = wrap(GaussianDropout(RAMP), OpacityNoise(rate), nn.Sequential(nn.Identity(), Half()))
+    chain = module if isinstance(module, Chain) else module[0]
+    chain.set_step(40)
+    earlier = copy.deepcopy(module.state_dict())
+    chain.set_step(100)
+    module.load_state_dict(earlier)
+    assert chain.step == 40
+    chain.eval()
+    assert torch.equal(chain(OPACITY), OPACITY * (1 - RAMP(40)) * 0.5)
+
+
 def test_an_unknown_entry_is_still_refused():
     with pytest.raises(RuntimeError, match="Unexpected key"):
         GaussianDropout(RAMP).load_state_dict({"rate": torch.tensor(0.1)})
