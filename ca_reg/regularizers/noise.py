@@ -125,10 +125,10 @@ class OpacityNoise(ParameterNoise):
 
     def expected(self, x: Params) -> Params:
         """Return the mean over all draws with ``scale``, else ``x`` itself."""
-        sigma = self.rate_at(x.step)
-        if not self.scale or is_zero(sigma):
+        if not self.scale or is_zero(self.rate_at(x.step)):
             return x
-        return x._replace(opacities=functional.expected_opacity(x.opacities, float(sigma), clip=self.clip))
+        x, factor = self.alpha_factor(x)  # not expected_opacity: survivors of compensated dropout may exceed 1
+        return x._replace(opacities=x.opacities * factor.mean)
 
     def alpha_factor(self, x: Params) -> tuple[Params, Multiplier]:
         """Return the opacities, clamped to 1, and the moments of their clamped noise.

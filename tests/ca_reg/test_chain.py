@@ -79,6 +79,16 @@ def test_the_test_time_value_of_dropout_and_noise_is_their_common_mean_in_either
     torch.testing.assert_close(chain(OPACITY), mean, rtol=1e-6, atol=0)
 
 
+def test_noise_in_eval_takes_the_survivors_of_compensated_dropout_that_trains():
+    p, sigma = 0.3, 0.8
+    chain = Chain(GaussianDropout(p, compensate=True), OpacityNoise(sigma, scale=True).eval())
+    rendered = chain(OPACITY)
+    survivors = OPACITY / (1 - p)
+    assert survivors.max() > 1
+    mean = (_WEIGHTS[:, None] * (survivors * (1 + sigma * _NODES[:, None])).clamp(0, 1)).sum(0)
+    torch.testing.assert_close(rendered, chain.keep * mean, rtol=1e-6, atol=0)
+
+
 def test_a_chain_drops_what_a_member_drops_and_replays():
     chain = Chain(GaussianDropout(0.5), ByOpacity(), OpacityNoise(0.5))
     opacity = torch.full((400,), 0.6)
