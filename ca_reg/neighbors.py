@@ -17,6 +17,10 @@ SMALLEST_SQUARED_DISTANCE = 1e-7  # INRIA's clamp: coinciding points still get a
 TREE_FROM = 4_000  # points; below that the other search takes less time than importing SciPy
 CHUNK_ELEMENTS = 4_000_000  # distances held at a time: 16 MB in float32
 LEAF = 64  # points of a box: fewer make more calls, more compare points that are far apart
+NOT_FINITE = (
+    "points must be finite, and so must squared distances, got nan or infinity: remove these Gaussians, or stop a "
+    "training that diverged."
+)
 
 
 @torch.no_grad()
@@ -34,7 +38,7 @@ def nearest_neighbors(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
         Squared distances, at least float32, and the neighbors' indices, int64, nearest first; shape (N, k) each.
 
     Raises:
-        ValueError: if the shape is not (N, 3), N is not above k, or a coordinate is nan.
+        ValueError: if the shape is not (N, 3), N is not above k, or a coordinate is nan or infinite.
 
     Example:
         >>> points = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0]])
@@ -56,6 +60,8 @@ def _by_tree(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Query SciPy's k-d tree for one more neighbor and remove the point itself."""
     from scipy.spatial import cKDTree
 
+    if not bool(points.isfinite().all()):
+        raise ValueError(NOT_FINITE)
     coordinates = _on_cpu(points)
     distances, indices = cKDTree(coordinates).query(coordinates, count + 1, workers=torch.get_num_threads())
     found, places = torch.from_numpy(distances), torch.from_numpy(indices)
@@ -99,10 +105,11 @@ def _by_leaves(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     within = [
         (gaps(some) <= reach[some, None]).sum(1) for some in torch.split(every, max(1, CHUNK_ELEMENTS // len(ids)))
     ]
-    numbers, order = torch.cat(within).sort(descending=True)
+    finite = (high - low).square().sum(1).isfinite()  # else a point may find itself, or what fills a leaf
+    numbers, order = (torch.cat(within) * finite).sort(descending=True)
     most = numbers.tolist()  # the one wait for a card
-    if most[-1] == 0:  # a box that is not at a distance of 0 from itself
-        raise ValueError("points must be finite, got nan: remove these Gaussians, or stop a training that diverged.")
+    if most[-1] == 0:  # else a box finds at least itself
+        raise ValueError(NOT_FINITE)
     squares, indices = points.new_empty(ids.numel(), count), torch.empty_like(ids).view(-1, 1).repeat(1, count)
     start = 0
     while start < len(order):

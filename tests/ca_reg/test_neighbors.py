@@ -90,11 +90,12 @@ def test_on_any_device(device):
 
 @pytest.mark.parametrize("tree_from", [0, 10**9], ids=["tree", "leaves"])
 @pytest.mark.parametrize("n", [9, 601])
-def test_points_that_are_no_numbers_are_refused(monkeypatch, n, tree_from):
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_points_that_are_not_finite_are_refused(monkeypatch, n, value, tree_from):
     monkeypatch.setattr(neighbors, "TREE_FROM", tree_from)
     points = _points("spread", n)
-    points[n // 2, 1] = torch.nan
-    with pytest.raises(ValueError, match="finite"):
+    points[n // 2, 1] = value
+    with pytest.raises(ValueError, match="must be finite.*remove these Gaussians"):
         nearest_neighbors(points, 3)
 
 
