@@ -95,7 +95,7 @@ def test_points_that_are_not_finite_are_refused(monkeypatch, n, value, tree_from
     monkeypatch.setattr(neighbors, "TREE_FROM", tree_from)
     points = _points("spread", n)
     points[n // 2, 1] = value
-    with pytest.raises(ValueError, match="must be finite.*remove these Gaussians"):
+    with pytest.raises(ValueError, match=r"must be finite.*remove these Gaussians"):
         nearest_neighbors(points, 3)
 
 
