@@ -166,7 +166,7 @@ def as_schedule(rate: float | Schedule) -> Schedule:
     return rate if callable(rate) else Constant(rate)
 
 
-def _is_captured() -> bool:
+def is_captured() -> bool:
     """Whether what is computed becomes part of a CUDA graph. PyTorch without CUDA has no answer."""
     initialized: bool = torch.cuda.is_initialized()  # type: ignore[no-untyped-call]
     return initialized and torch.cuda.is_current_stream_capturing()
@@ -227,7 +227,7 @@ class Scheduled(nn.Module):
             return self._schedule.value  # checked at construction; does not read the step, which would recompile
         if self._rate is not None and torch.compiler.is_compiling():
             return self._rate
-        if _is_captured():
+        if is_captured():
             raise RuntimeError(
                 f"a CUDA graph would keep {self.rate_name or 'the rate'} of the step at which it is captured, for all "
                 f"replays: {self._schedule} is not constant. Capture with a constant rate, or draw outside the graph."
@@ -251,7 +251,7 @@ class Scheduled(nn.Module):
         Graphs, compiled or captured, skip the range check: their control flow cannot depend on values.
         """
         check_opacity(opacity)
-        if torch.compiler.is_compiling() or self._opacity_seen or _is_captured():
+        if torch.compiler.is_compiling() or self._opacity_seen or is_captured():
             return
         # Compensated dropout before this module may have raised opacities above 1.
         check_opacity_range(opacity, upper=math.inf)

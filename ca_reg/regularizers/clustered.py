@@ -11,7 +11,7 @@ from ca_reg import functional
 from ca_reg._check import Rate, check_count, check_rate, is_zero
 from ca_reg.regularizer import Draw, Params, Regularizer
 from ca_reg.regularizers.surroundings import Refreshed, neighbors_of
-from ca_reg.schedules import LinearRamp, Schedule
+from ca_reg.schedules import LinearRamp, Schedule, is_captured
 
 __all__ = ["AnchorDropout", "ClusteredDropout", "SHDropout"]
 
@@ -126,7 +126,8 @@ class SHDropout(Regularizer):
 
     Args:
         p: rate in [0, 1), or a schedule of it. 0.2 in the paper.
-        until: the steps at which the degree rises. 2,000, 4,000 and 6,000 in the paper.
+        until: the steps at which the degree rises. 2,000, 4,000 and 6,000 in the paper. Before the last, a CUDA graph,
+            which would keep the degree, is refused with a RuntimeError.
 
     Example:
         >>> x = Params(torch.ones(1000), sh=torch.ones(1000, 16, 3), step=2500)
@@ -157,6 +158,11 @@ class SHDropout(Regularizer):
         count = (degree + 1) ** 2
         if is_zero(rate) or degree == len(self.until) or count >= x.sh.shape[1]:
             return Draw()
+        if is_captured():
+            raise RuntimeError(
+                f"a CUDA graph would keep the degree {degree} of the step {step} at which it is captured, for all "
+                f"replays, although it rises at {self.until}: draw outside the graph."
+            )
         return Draw((functional.draw_keep_mask(len(x.sh), rate, generator=generator, device=x.sh.device), count))
 
     def replay(self, x: Params, draw: Draw) -> Params:

@@ -12,9 +12,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.checkpoint import checkpoint
 
-from ca_reg import CAPenalty, Chain, GaussianDropout, OpacityNoise
+from ca_reg import CAPenalty, Chain, GaussianDropout, OpacityNoise, Params
 from ca_reg.functional import Multiplier
 from ca_reg.regularizers import parse
+from ca_reg.regularizers.clustered import SHDropout
 from ca_reg.schedules import LinearRamp
 
 OPACITY = torch.linspace(0.05, 0.95, 40)
@@ -260,6 +261,14 @@ def test_a_graph_that_would_keep_the_rate_of_its_capture_is_refused(capture):
     module.set_step(50)
     with pytest.raises(RuntimeError, match=r"keep p of the step at which it is captured.*LinearRamp.*constant rate"):
         module(OPACITY)
+
+
+def test_a_graph_that_would_keep_the_degree_of_its_capture_is_refused(capture):
+    module, x = SHDropout(0.2, until=(20, 40)), Params(OPACITY, sh=torch.ones(40, 16, 3))
+    with pytest.raises(RuntimeError, match=r"keep the degree 1 of the step 30 at which it is captured.*\(20, 40\)"):
+        module(x._replace(step=30))
+    last = x._replace(step=40)  # nothing is dropped any more, at no later step either
+    assert module(last) is last
 
 
 @pytest.mark.gpu
