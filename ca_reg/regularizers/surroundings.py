@@ -14,7 +14,7 @@ from ca_reg._precision import at_least_single, without_autocast
 from ca_reg.neighbors import nearest_neighbors
 from ca_reg.regularizer import Params
 from ca_reg.regularizers.dropout import IndependentDropout
-from ca_reg.schedules import Schedule
+from ca_reg.schedules import Schedule, is_captured
 
 __all__ = [
     "DensityDropout", "GeometryDropout", "RankedDropout", "Refreshed", "SurroundingsDropout", "mean_distances",
@@ -28,7 +28,8 @@ class Refreshed(nn.Module):
     A tensor with one row per Gaussian, measured again every ``every`` steps and when their number changes. If the step
     has not advanced it is recomputed unless the very same means come again, unmodified: one object may score several
     models. ``state_dict`` holds the tensor and its step; a checkpoint without them starts afresh. Pruning as many
-    Gaussians as are added goes unnoticed until the next refresh.
+    Gaussians as are added goes unnoticed until the next refresh. The capture of a CUDA graph, which would never measure
+    again, is refused with a RuntimeError.
     """
 
     value: Tensor | None
@@ -44,6 +45,11 @@ class Refreshed(nn.Module):
     def forward(self, x: Params, compute: Callable[[Tensor], Tensor]) -> Tensor:
         """Return ``compute(means)``, fresh or cached."""
         assert x.means is not None
+        if is_captured():
+            raise RuntimeError(
+                "a CUDA graph would keep what surrounds the Gaussians at the step at which it is captured, for all "
+                "replays: draw outside the graph."
+            )
         means = x.means.detach()
         if self.value is None or not self.holds(x):
             # A value computed at test time may be used in training; autocast would find neighbors in 16 bits.

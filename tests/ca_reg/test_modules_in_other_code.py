@@ -271,6 +271,15 @@ def test_a_graph_that_would_keep_the_degree_of_its_capture_is_refused(capture):
     assert module(last) is last
 
 
+@pytest.mark.parametrize("text", ["position_noise(0.1)", "density", "clustered(0.2)"])
+def test_a_graph_that_would_keep_the_neighbors_of_its_capture_is_refused(request, text):
+    module, x = parse(text), Params(OPACITY, means=torch.rand(40, 3), step=30)
+    module(x)  # the neighbors are known by now
+    request.getfixturevalue("capture")
+    with pytest.raises(RuntimeError, match="keep what surrounds the Gaussians at the step at which it is captured"):
+        module(x._replace(step=31))
+
+
 @pytest.mark.gpu
 @GRAPHED
 def test_a_cuda_graph_draws_anew_at_every_replay(text):
