@@ -148,20 +148,41 @@ def _parse(arguments: Sequence[str]) -> Any:
         raise _in_a_line(heard.getvalue(), arguments) or end from None
 
 
+def _similar_options(heard: str, given: str) -> dict[str, list[str]]:
+    """Return the options that tyro finds similar to a given one, most similar first, with the commands that have them.
+
+    It lists each alike indented, with a line of the box before it or, in ASCII, without; below it, further in, come
+    help and commands.
+    """
+    found: dict[str, list[str]] = {}
+    listed: list[str] = []
+    sections = re.split(r"Perhaps you meant:|Arguments similar to (?=\S+:)", heard)[1:]
+    for line in next((x for x in sections if x.startswith(f"{given}:")), "".join(sections[:1])).splitlines():
+        if re.match(r"[│ ] {5}--", line):
+            listed = re.findall(r"--[a-z-]+", line)
+        elif command := re.search(r" in ca-reg ([a-z]+).* --help", line):
+            for option in listed:
+                found.setdefault(option, []).append(command[1])
+    return found
+
+
 def _in_a_line(heard: str, arguments: Sequence[str]) -> ValueError | None:
     """Return what tyro says in a box, with inner names and help of other commands, as an error like all others."""
-    text = " ".join(re.sub(r"[│╭╮╰╯─|]|-{3,}", " ", re.sub(r"\x1b\[[0-9;]*m", "", heard)).split()).partition(
-        " For full helptext"
-    )[0]
+    heard = re.sub(r"\x1b\[[0-9;]*m", "", heard)
+    text = " ".join(re.sub(r"[│╭╮╰╯─|]|-{3,}", " ", heard).split()).partition(" For full helptext")[0]
     command = next((word for word in arguments if not word.startswith("-")), "")
     if found := re.search(r"Error parsing \S+: (.*?)( Argument helptext: (\S+) (\S+) .*)?$", text):
         return ValueError(f"{found[3]} expects {found[4]}: {found[1]}." if found[2] else found[1])
-    if found := re.search(r"(?<=Unrecognized options: )([^ ,]+)(?:.*Available subcommands: (.*))?", text):
-        near = re.findall(r"--[a-z-]+(?= )", text.partition("Perhaps you meant:")[2])
-        near = near or get_close_matches(found[1], (names := (found[2] or "").split(", ")), 1) or names
-        meant = f": did you mean {near[0]}?" if len(near) == 1 or near[0][0] == "-" else f": choose one of {found[2]}."
-        help_ = "--help" if found[2] else f"{command} --help"
-        return ValueError(f"there is no {found[1]}{meant if near[0] else '.'} All options: ca-reg {help_}")
+    if found := re.search(r"Unrecognized (?:or misplaced )?options: ([^ ,]+)(?:.*Available subcommands: (.*))?", text):
+        given, names = found[1].partition("=")[0], (found[2] or "").split(", ")
+        near = _similar_options(heard, given)
+        own = [option for option, commands in near.items() if command in commands] or get_close_matches(given, names, 1)
+        of = f", an option of {', '.join(near.get(given) or next(iter(near.values()), []))}"
+        if given in near:
+            return ValueError(f"{command} has no {given}{of}. All options: ca-reg {command} --help")
+        meant = f": did you mean {own[0]}?" if own else f": did you mean {next(iter(near))}{of}?" if near else "."
+        meant = f": choose one of {found[2]}." if found[2] and not own else meant
+        return ValueError(f"there is no {given}{meant} All options: ca-reg {'' if found[2] else f'{command} '}--help")
     if found := re.search(r"Missing from .*?: (\S+) (.*) \(required\)", text):
         return ValueError(f"{command} needs {found[1]}: {found[2]} See ca-reg {command} --help")
     text = re.sub(r"^.*?(?=invalid choice|Expected one|Missing value)", "", text)

@@ -75,7 +75,11 @@ def test_help(command, options, capsys):
     ("command", "named"),
     [("trian", "train"), ("xyzzy", "compare"), ("train synthetic --dropuot 0.2", "--dropout"), ("run", "PATH"),
      ("train --iterations few", "--iterations"), ("train --recipe 3dgz", "3dgs"), ("train --out", "--out"),
-     ("run p --from trian", "photographs"), ("study stabilty", "stability"), ("report", "run")],
+     ("run p --from trian", "photographs"), ("study stabilty", "stability"), ("report", "run"),
+     ("run p --frmes 3", "did you mean --frames?"), ("run p --no-auto", "run has no --no-auto, an option of train."),
+     ("plan p --monitor-every=0", "plan has no --monitor-every, an option of compare, train."),
+     ("plan p --monitor-evry 3", "did you mean --monitor-every, an option of compare, train?"),
+     ("clean m.ply --monitor-every 3 --jobs 2", "clean has no --monitor-every, an option of compare, train.")],
 )  # fmt: skip
 @pytest.mark.parametrize("terminal", [False, True])
 def test_a_mistake_is_answered_in_one_line(command, named, terminal, capsys, monkeypatch):
