@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 def load_run_model(
     run: Path, device: str = "cpu", *, regularizer: str | None = None, trust: Collection[str] = ()
 ) -> tuple[TrainedModel, Scene]:
-    """Return a run's model at its last checkpoint, and its scene.
+    """Return a run's model at its last checkpoint, and its scene; logs where that is if the training is not finished.
 
     With ``regularizer``, such as "noise(0.8, scale=True)" for a run with "noise(0.8)", the model is treated as if it
     had been trained with that. ``trust`` is as for `load_run`.
@@ -46,6 +46,8 @@ def load_run_model(
         ValueError: if the expression cannot be parsed, or the run names code that is not trusted.
     """
     trainer = load_run(run, device, trust=trust)
+    if trainer.step < (last := trainer.config.iterations):
+        _log.info("%s is not trained to its end: this is its model of step %d of %d", run, trainer.step, last)
     model = model_of(trainer)
     if regularizer is not None:
         parse(regularizer)

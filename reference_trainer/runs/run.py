@@ -164,14 +164,14 @@ def run_experiment(
     perceptual = load_lpips(lpips, device=device)
     settings_of_run(out, options, config, auto=auto, given=given)
     if (out / RESULTS).exists():
-        return _complete(out)
+        return _complete(out, perceptual)
     # Before the folder is made, so that a mistyped scene does not claim it.
     scene = load_scene(options, seed=config.seed)
     _log.info(scene)
     with run_lock(out), threads_for(scene.pixels):
         begun = settings_of_run(out, options, config, auto=auto, given=given)  # perhaps since, by another process
         if (out / RESULTS).exists():
-            return _complete(out)
+            return _complete(out, perceptual)
         settings = _planned(scene, config, out, auto=auto, given=given, device=device) if begun is None else begun
         remove_leftovers(out, below=False)  # an evaluation of the run may be writing to a subfolder right now
         remove_leftovers(out / VIEWS)
@@ -214,10 +214,13 @@ def _load(folder: Path, scene: Scene, device: torch.device | str, trust: Collect
     return Trainer.load(folder / CHECKPOINT, scene, device, refuse=lambda config: check_trusted(folder, config, trust))
 
 
-def _complete(out: Path) -> dict[str, Any]:
-    """Return the results of a complete run."""
+def _complete(out: Path, perceptual: LPIPS | None) -> dict[str, Any]:
+    """Return the results of a complete run; logs if they lack the metric that is asked for."""
     _log.info("%s: complete, nothing to do", out)
-    return read_results(out)
+    results = read_results(out)
+    if perceptual is not None and results.get("perceptual_metric") != perceptual.name:
+        _log.info("%s was measured without %s: ca-reg evaluate with --lpips does that", out, perceptual.name)
+    return results
 
 
 def _planned(

@@ -4,6 +4,7 @@ import shutil
 import signal
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from reference_trainer.evaluation.tables import evaluation_table, summary
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import run as run_module
 from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, COMPARISON, CONFIG, PLAN, PLY, RESULTS, read_results
+from reference_trainer.runs.measure import load_run_model
 from reference_trainer.runs.run import Monitoring, load_run, model_of, run_experiment
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
@@ -94,10 +96,19 @@ def test_a_second_call_does_nothing(finished, options, short, monkeypatch, said)
     assert said == [f"{out}: complete, nothing to do"]
 
 
+def test_a_complete_run_says_that_it_lacks_the_metric_that_is_asked_for(finished, options, short, monkeypatch, said):
+    metric = SimpleNamespace(name="lpips-alex")
+    monkeypatch.setattr("reference_trainer.runs.run.load_lpips", lambda *_, **__: metric)
+    run_experiment(options, short, finished[0], lpips="weights.pth", **EVERY)
+    assert said[-1] == f"{finished[0]} was measured without lpips-alex: ca-reg evaluate with --lpips does that"
+
+
 def test_ctrl_c_saves_where_it_is(finished, options, short, ctrl_c, tmp_path, said):
     """Between two periodic checkpoints nothing is lost."""
     with ctrl_c(5):
         run_experiment(options, short, tmp_path, **EVERY)
+    load_run_model(tmp_path)  # for its scores or pictures, which are of a model in the middle of its training
+    assert said[-1] == f"{tmp_path} is not trained to its end: this is its model of step 6 of 11"
     run_experiment(options, short, tmp_path, **EVERY)
     assert f"{tmp_path}: continues from step 6" in said
     assert (tmp_path / PLY).read_bytes() == (finished[0] / PLY).read_bytes()
