@@ -65,13 +65,13 @@ def test_scores_are_those_of_the_workload_drawn_by_the_engine(engine, monkeypatc
         return drawn[-1]
 
     monkeypatch.setattr(training_step.TrainedModel, "splats", spy)
-    workload = WorkloadSpec(80, 40, 24, 0.06).make()
+    workload = WorkloadSpec(300, 40, 24, 0.06).make()
     calls = scores(workload, engine)
     found, _ = calls["render"]()
     torch.testing.assert_close(found, image(draw_of(engine), workload), rtol=0, atol=1e-5)
     exact = calls["exact score"]()
     sampled = [calls["score, K = 5"]() for _ in range(2)]
-    assert [len(x.indices) for x in drawn] == [80] * 3  # one projection for each score, none is kept
+    assert [len(x.indices) for x in drawn] == [300] * 3  # one projection for each score, none is kept
     assert {x.engine.name for x in drawn} == {engine}
     assert 0 < exact.value < 1
     assert sampled[0].value == sampled[1].value > 0
