@@ -18,6 +18,7 @@ from ca_reg._random import PortableGenerator
 from ca_reg.functional import Multiplier
 from ca_reg.regularizer import Params, Regularizer
 from ca_reg.regularizers import GaussianDropout
+from ca_reg.regularizers.surroundings import with_own_memory
 from ca_reg.result import COLUMNS, CAResult, CASettings, CASummary, Method, Reason, row_of, summary_of, view_position
 from ca_reg.types import (
     ExactMoments,
@@ -214,6 +215,7 @@ class CAScore:
             raise ValueError("p and drop_rate do not apply to the draws of a regularizer, which has rates of its own.")
         else:
             self.regularizer, others["regularizer"] = regularizer, repr(regularizer)
+        self._measured = with_own_memory(self.regularizer)
         self.p, self.layout = float(p), layout
         self.settings = CASettings(method=method, threshold=float(threshold), **others)
         self.reset()
@@ -302,7 +304,7 @@ class CAScore:
 
     def _alpha_factor(self, x: Params) -> tuple[Params, Multiplier]:
         """Return the regularizer's ``alpha_factor``, or raise if it has none."""
-        factor = self.regularizer.alpha_factor(x._replace(opacities=x.opacities.reshape(-1)))
+        factor = self._measured.alpha_factor(x._replace(opacities=x.opacities.reshape(-1)))
         if factor is None:
             raise ValueError(
                 f"the draws of {type(self.regularizer).__name__} are no independent factors of the opacities, which an "
@@ -322,7 +324,7 @@ class CAScore:
             None,
         )
         for _ in range(count):
-            drawn, *others = self.regularizer.replay(flat, self.regularizer.draw(flat, generator))
+            drawn, *others = self._measured.replay(flat, self._measured.draw(flat, generator))
             if any(a is not b for a, b in zip(others, flat[1:], strict=True)):
                 raise ValueError(
                     f"{type(self.regularizer).__name__} changes more than opacities, which is all that render_fn is "

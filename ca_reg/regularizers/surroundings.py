@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import weakref
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -18,8 +19,10 @@ from ca_reg.schedules import Schedule, is_captured
 
 __all__ = [
     "DensityDropout", "GeometryDropout", "RankedDropout", "Refreshed", "SurroundingsDropout", "mean_distances",
-    "neighbors_of", "relative_ranks", "surface_variation",
+    "neighbors_of", "relative_ranks", "surface_variation", "with_own_memory",
 ]  # fmt: skip
+
+M = TypeVar("M", bound=nn.Module)
 
 
 class Refreshed(nn.Module):
@@ -79,6 +82,20 @@ class Refreshed(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         self.value, self._seen = state_dict.pop(prefix + "value", None), None
         self.since = int(state_dict.pop(prefix + "since", 0))
+
+
+def with_own_memory(module: M) -> M:
+    """Return a module that shares everything with this one but what it remembers of the surroundings.
+
+    So a score may measure with the regularizer of a training, at whatever step and model, and not change its draws.
+    """
+    if not any(isinstance(part, Refreshed) for part in module.modules()):
+        return module
+    twin = copy.copy(module)
+    twin._modules = {name: part and with_own_memory(part) for name, part in module._modules.items()}
+    if isinstance(twin, Refreshed):
+        twin._buffers = {"value": None}
+    return twin
 
 
 class SurroundingsDropout(IndependentDropout):

@@ -1,5 +1,6 @@
 """Scores whose draws are those of a regularizer, against enumeration of its masks."""
 
+import contextlib
 import itertools
 
 import pytest
@@ -8,6 +9,7 @@ from torch import nn
 
 from ca_reg import CAMonitor, CAScore, Chain, Draw, GaussianDropout, IndependentDropout, Params, Regularizer
 from ca_reg.lists import ListMoments, PixelLists
+from ca_reg.regularizers import parse
 from ca_reg.regularizers.noise import ScaleNoise
 from ca_reg.schedules import LinearRamp
 
@@ -149,3 +151,32 @@ def test_the_protocol_is_the_score_of_uniform_dropout():
 def test_what_does_not_go_together_is_refused(make, arguments, message):
     with pytest.raises(ValueError, match=message):
         make(render, **arguments)(OPACITY, None)
+
+
+@pytest.mark.parametrize(
+    "text", ["density", "geometry", "clustered(0.4)", "drop_anchors(0.1)", "dropout(0.3) + density"]
+)
+@pytest.mark.parametrize("kind", [CAScore, CAScore.exact], ids=["sampled", "exact"])
+def test_a_score_with_the_regularizer_of_a_training_does_not_change_its_masks(text, kind):
+    """Nor does it read what training measured: the means have moved since."""
+
+    def renderer(opacity, view, *moments):
+        image = opacity[:48].reshape(3, 4, 4)
+        return {"mean": image, "variance": 0 * image, "alpha_mean": image[0]} if moments else (image, image[0])
+
+    def masks(scores):
+        rule, generator = parse(text), torch.Generator().manual_seed(0)
+        score, found = kind(renderer, regularizer=rule, threshold=0.0), []
+        means = torch.rand(60, 3, generator=generator)
+        for step in range(600, 610):
+            means = means + 0.2 * torch.randn(60, 3, generator=generator)
+            x = Params(torch.full((60,), 0.9), means=means, step=step)
+            found.append(rule(x, generator=generator).opacities)
+            if scores:
+                with contextlib.suppress(ValueError):  # not all have independent factors, for an exact score
+                    score(Params(x.opacities, means=means), None)
+        return torch.stack(found)
+
+    plain = masks(scores=False)
+    assert (plain == 0).any()
+    assert torch.equal(masks(scores=True), plain)
