@@ -194,8 +194,9 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
             })  # fmt: skip
             if scene in FAILING:
                 counts.setdefault(name, []).extend(failed)
-        if CHOSEN in figures and scene in FAILING:
-            below += [x < figures["plain"][seed] for seed, x in figures[CHOSEN].items() if seed in figures["plain"]]
+        if scene in FAILING:
+            plain, own = (figures.get(name, {}) for name in ("plain", CHOSEN))
+            below += [own[seed] < plain[seed] for seed in own.keys() & plain.keys()]
     if not lines:
         return f"No setting has {SEEDS} seeds."
     shares = [f"{name}: {_share(of)} fail" for name, of in counts.items()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 from benchmarks import setting
 
@@ -53,3 +54,11 @@ def test_a_failure_is_a_decibel_below_the_median_of_its_own_seeds(tmp_path):
     assert "drawn: 2 of 5 (5 to 85 %) fail" in text
     assert "plain: 0 of 5 (0 to 52 %) fail" in text
     assert "drawn below plain, same seed: 2 of 5" in text
+
+
+def test_the_page_has_the_tables_of_its_rows():
+    page = Path(setting.__file__).with_suffix(".md").read_text("utf-8")
+    rows = json.loads((setting.REFERENCES.parent / "setting.json").read_text("utf-8"))
+    lines = page.splitlines()
+    for table in (setting.choosing(rows), setting.judging(rows), setting.failures(rows)):
+        assert [line for line in table.splitlines() if line and line not in lines] == []
