@@ -172,6 +172,15 @@ def is_captured() -> bool:
     return initialized and torch.cuda.is_current_stream_capturing()
 
 
+def refuse_capture(what: str, remedy: str = "draw outside the graph") -> None:
+    """Raise a RuntimeError in the capture of a CUDA graph, which would keep for all replays ``what`` belongs to a step.
+
+    ``what`` ends with that step, as in "the degree 1 of the step 30".
+    """
+    if is_captured():
+        raise RuntimeError(f"a CUDA graph would keep {what} at which it is captured, for all replays: {remedy}.")
+
+
 class Scheduled(nn.Module):
     """A module without parameters whose rate may follow a schedule; it checks the range of the first opacities.
 
@@ -227,11 +236,10 @@ class Scheduled(nn.Module):
             return self._schedule.value  # checked at construction; does not read the step, which would recompile
         if self._rate is not None and torch.compiler.is_compiling():
             return self._rate
-        if is_captured():
-            raise RuntimeError(
-                f"a CUDA graph would keep {self.rate_name or 'the rate'} of the step at which it is captured, for all "
-                f"replays: {self._schedule} is not constant. Capture with a constant rate, or draw outside the graph."
-            )
+        refuse_capture(
+            f"{self.rate_name or 'the rate'} of the step",
+            f"{self._schedule} is not constant. Capture with a constant rate, or draw outside the graph",
+        )
         return self._present_rate(step)
 
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:

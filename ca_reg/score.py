@@ -318,11 +318,8 @@ class CAScore:
         ``differ`` takes, for every draw but the first, whether it differs from that, as a tensor that is not yet read.
         """
         # One generator per view: more renders extend the sequence, other views do not shift it.
-        generator, flat, first = (
-            PortableGenerator(self.seed, index),
-            x._replace(opacities=x.opacities.reshape(-1)),
-            None,
-        )
+        generator = PortableGenerator(self.seed, index)
+        flat, first = x._replace(opacities=x.opacities.reshape(-1)), None
         for _ in range(count):
             drawn, *others = self._measured.replay(flat, self._measured.draw(flat, generator))
             if any(a is not b for a, b in zip(others, flat[1:], strict=True)):

@@ -11,7 +11,7 @@ from ca_reg import functional
 from ca_reg._check import Rate, check_count, check_rate, is_zero
 from ca_reg.regularizer import Draw, Params, Regularizer
 from ca_reg.regularizers.surroundings import Refreshed, neighbors_of
-from ca_reg.schedules import LinearRamp, Schedule, is_captured
+from ca_reg.schedules import LinearRamp, Schedule, refuse_capture
 
 __all__ = ["AnchorDropout", "ClusteredDropout", "SHDropout"]
 
@@ -158,11 +158,7 @@ class SHDropout(Regularizer):
         count = (degree + 1) ** 2
         if is_zero(rate) or degree == len(self.until) or count >= x.sh.shape[1]:
             return Draw()
-        if is_captured():
-            raise RuntimeError(
-                f"a CUDA graph would keep the degree {degree} of the step {step} at which it is captured, for all "
-                f"replays, although it rises at {self.until}: draw outside the graph."
-            )
+        refuse_capture(f"the degree {degree} of the step {step}", f"it rises at {self.until}. Draw outside the graph")
         return Draw((functional.draw_keep_mask(len(x.sh), rate, generator=generator, device=x.sh.device), count))
 
     def replay(self, x: Params, draw: Draw) -> Params:

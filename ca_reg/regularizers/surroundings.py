@@ -15,7 +15,7 @@ from ca_reg._precision import at_least_single, without_autocast
 from ca_reg.neighbors import nearest_neighbors
 from ca_reg.regularizer import Params
 from ca_reg.regularizers.dropout import IndependentDropout
-from ca_reg.schedules import Schedule, is_captured
+from ca_reg.schedules import Schedule, refuse_capture
 
 __all__ = [
     "DensityDropout", "GeometryDropout", "RankedDropout", "Refreshed", "SurroundingsDropout", "mean_distances",
@@ -48,11 +48,7 @@ class Refreshed(nn.Module):
     def forward(self, x: Params, compute: Callable[[Tensor], Tensor]) -> Tensor:
         """Return ``compute(means)``, fresh or cached."""
         assert x.means is not None
-        if is_captured():
-            raise RuntimeError(
-                "a CUDA graph would keep what surrounds the Gaussians at the step at which it is captured, for all "
-                "replays: draw outside the graph."
-            )
+        refuse_capture("what surrounds the Gaussians at the step")
         means = x.means.detach()
         if self.value is None or not self.holds(x):
             # A value computed at test time may be used in training; autocast would find neighbors in 16 bits.

@@ -23,7 +23,7 @@ from reference_trainer.runs.folder import (
     folder_name,
     report_file,
     settings_of_run,
-)  # fmt: skip
+)
 from reference_trainer.runs.grid import Run, Running, run_grid
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
