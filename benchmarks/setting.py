@@ -33,7 +33,7 @@ from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["candidate", "choosing", "differences", "failures", "judging", "main", "measured"]
+__all__ = ["binocular", "candidate", "choosing", "differences", "failures", "judging", "main", "measured"]
 
 Row = dict[str, Any]
 """``scene``, ``candidate`` and ``seed``, ``held-out`` PSNR if there are such views, ``test`` figures, ``gaussians``."""
@@ -42,14 +42,23 @@ _FIGURES = "psnr", "ssim", "lpips", "ca_exact_half"
 CHOSEN = "drawn"
 """The candidate that is judged."""
 SEEDS = 5
-"""So many, from 0 on, judge the chosen one; from so many on, a setting stands in the table of failures."""
+"""So many, from 0 on, judge the chosen one."""
+FEWEST = 3
+"""From so many seeds on, a setting stands in the table of failures."""
 FAILURE = 1.0
 """A training so many dB below the median of its scene and setting has failed."""
 FAILING = ("herz-jesu", "fountain", "dtu-scan65", "sceaux")
 """The scenes of the study of failures."""
 REFERENCES = Path(__file__).with_name("data") / "paper"
 """Folder with the rows of the paper's grid."""
-_REFERENCES = {"plain": {}, "dropout": {"regularizer": "dropout(0.2)"}}
+BINOCULAR = "Binocular3DGS, dropout"
+_REFERENCES: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "dropout": {"regularizer": "dropout(0.2)"},
+    "noise": {"regularizer": "noise(0.8)"},
+    "expectation": {"regularizer": "dropout(0.2)", "analytic": True},
+    BINOCULAR: {"recipe": "binocular", "regularizer": "dropout(0.2)"},
+}
 
 
 def main(
@@ -75,7 +84,7 @@ def main(
                 write_json(out, rows)
     else:
         rows = json.loads(paths[0].read_text("utf-8"))
-    print(choosing(rows), judging(rows), failures(rows), sep="\n\n")
+    print(choosing(rows), judging(rows), binocular(rows), failures(rows), sep="\n\n")
 
 
 def candidate(config: TrainConfig) -> str:
@@ -135,7 +144,8 @@ def judging(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     lines, perceptual, counts, spreads = [], list[float](), list[float](), list[float]()
     gains = differences(rows, references)
     for scene, pairs in gains.items():
-        compared = {**_references(rows, references, scene), CHOSEN: _of(rows, scene, CHOSEN)}
+        known = _references(rows, references, scene)
+        compared = {"plain": known["plain"], "dropout": known["dropout"], CHOSEN: _of(rows, scene, CHOSEN)}
         compared = {name: {seed: row for seed, row in of.items() if seed < SEEDS} for name, of in compared.items()}
         _, dropout, own = compared.values()
         perceptual.append(_mean(own, "test lpips") - _mean(dropout, "test lpips"))
@@ -173,32 +183,49 @@ def differences(rows: Sequence[Row], references: Path = REFERENCES) -> dict[str,
     return found
 
 
+def binocular(rows: Sequence[Row], references: Path = REFERENCES) -> str:
+    """Return the table of the chosen one against Binocular3DGS with dropout, over the seeds that both have."""
+    lines, ahead = [], list[float]()
+    for scene in SCENES:
+        own, other = _of(rows, scene, CHOSEN), _references(rows, references, scene)[BINOCULAR]
+        shared = sorted(own.keys() & other.keys())
+        if not shared:
+            continue
+        pairs = [value(own[seed], "test psnr") - value(other[seed], "test psnr") for seed in shared]
+        ahead.append(fmean(pairs))
+        line = {"scene": scene, "seeds": str(len(shared))}
+        for name, of in ((BINOCULAR, other), (CHOSEN, own)):
+            line[f"{name} PSNR"] = format_mean_std((value(of[seed], "test psnr") for seed in shared), decimals=2)
+        lines.append(line | {"ahead, by seed": ", ".join(f"{x:+.2f}" for x in pairs)})
+    if not lines:
+        return f"Nothing of {BINOCULAR!r} was measured."
+    won = f"{CHOSEN} ahead on {sum(x > 0 for x in ahead)} of {len(ahead)} scenes, by {fmean(ahead):+.2f} dB in the mean"
+    return "\n".join([markdown_table(lines, list(lines[0])), "", f"- {won}"])
+
+
 def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     """Return the table of the seeds: median, spread and the worst by scene and setting, and how often one fails."""
-    lines, counts, below = [], dict[str, list[int]](), list[bool]()
-    for scene in SCENES:
-        every = {name: _of(rows, scene, name) for name in dict.fromkeys(row["candidate"] for row in rows)}
-        every |= _references(rows, references, scene)
+    lines, counts, below = [], dict[str, list[bool]](), list[bool]()
+    for scene in FAILING:
+        every = {CHOSEN: _of(rows, scene, CHOSEN)} | _references(rows, references, scene)
         figures = {
             name: {seed: value(row, "test psnr") for seed, row in of.items()}
             for name, of in every.items()
-            if len(of) >= SEEDS
+            if len(of) >= FEWEST
         }
         for name, of in figures.items():
             middle, worst = median(of.values()), min(of.values())
             failed = [x < middle - FAILURE for x in of.values()]
+            counts.setdefault(name, []).extend(failed)
             lines.append({
                 "scene": scene, "setting": name, "seeds": str(len(of)), "median": f"{middle:.2f}",
                 "standard deviation": f"{mean_std(of.values())[1]:.2f}", "worst": f"{worst:.2f}",
                 "to the median": f"{worst - middle:+.2f}", "failures": str(sum(failed)),
             })  # fmt: skip
-            if scene in FAILING:
-                counts.setdefault(name, []).extend(failed)
-        if scene in FAILING:
-            plain, own = (figures.get(name, {}) for name in ("plain", CHOSEN))
-            below += [own[seed] < plain[seed] for seed in own.keys() & plain.keys()]
+        plain, own = (figures.get(name, {}) for name in ("plain", CHOSEN))
+        below += [own[seed] < plain[seed] for seed in own.keys() & plain.keys()]
     if not lines:
-        return f"No setting has {SEEDS} seeds."
+        return f"No setting has {FEWEST} seeds."
     shares = [f"{name}: {_share(of)} fail" for name, of in counts.items()]
     together = [*shares, f"{CHOSEN} below plain, same seed: {_share(below)}"]
     return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {line}" for line in together)])

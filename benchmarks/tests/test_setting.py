@@ -41,6 +41,18 @@ def test_a_pair_is_of_one_scene_and_seed(tmp_path):
     assert "Gaussians against dropout alone, mean over scenes: 0.50" in text
 
 
+def test_binocular_is_met_by_seeds_that_both_have(tmp_path):
+    other = "Binocular3DGS, dropout"
+    rows = [row("fern", "drawn", seed, psnr) for seed, psnr in enumerate((25.0, 25.5, 26.0))]
+    rows += [row("fern", other, 0, 24.0), row("fern", other, 1, 25.0), row("cape", "drawn", 0, 21.0)]
+    rows += [row("sceaux", "drawn", 2, 20.0), row("sceaux", other, 2, 20.25)]
+    text = setting.binocular(rows, tmp_path)
+    assert "+1.00, +0.50" in text
+    assert "-0.25" in text
+    assert "cape" not in text
+    assert "drawn ahead on 1 of 2 scenes, by +0.25 dB in the mean" in text
+
+
 def test_a_failure_is_a_decibel_below_the_median_of_its_own_seeds(tmp_path):
     figures = {"plain": (20.0, 20.5, 19.4, 20.1, 20.2), "drawn": (21.0, 19.9, 21.2, 21.1, 19.0)}
     rows = [row("fountain", name, seed, psnr) for name, of in figures.items() for seed, psnr in enumerate(of)]
@@ -60,5 +72,5 @@ def test_the_page_has_the_tables_of_its_rows():
     page = Path(setting.__file__).with_suffix(".md").read_text("utf-8")
     rows = json.loads((setting.REFERENCES.parent / "setting.json").read_text("utf-8"))
     lines = page.splitlines()
-    for table in (setting.choosing(rows), setting.judging(rows), setting.failures(rows)):
+    for table in (setting.choosing(rows), setting.judging(rows), setting.binocular(rows), setting.failures(rows)):
         assert [line for line in table.splitlines() if line and line not in lines] == []
