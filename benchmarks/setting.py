@@ -33,11 +33,24 @@ from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["binocular", "candidate", "choosing", "differences", "failures", "judging", "main", "measured"]
+__all__ = ["binocular", "candidate", "choosing", "differences", "failures", "judging", "main", "measured", "second"]
 
 Row = dict[str, Any]
 """``scene``, ``candidate`` and ``seed``, ``held-out`` PSNR if there are such views, ``test`` figures, ``gaussians``."""
 
+_SECOND: dict[str, tuple[str, Any]] = {
+    "until 2,000": ("densify_until", 2_000),
+    "from 500": ("densify_from", 500),
+    "no reset": ("opacity_reset_every", 0),
+    "rate 0.3": ("dropout", 0.3),
+    "threshold 2e-4": ("densify_gradient", 2e-4),
+    "degree 1": ("sh_degree", 1),
+    "random background": ("random_background", True),
+    "warp": ("loss", "warp("),
+    "depth of the points": ("loss", "pearson("),
+    "flat": ("loss", "flat("),
+}
+"""What a candidate of the second choice changes in the chosen setting: a field and its value, of a loss the term."""
 _FIGURES = "psnr", "ssim", "lpips", "ca_exact_half"
 CHOSEN = "drawn"
 """The candidate that is judged."""
@@ -84,7 +97,9 @@ def main(
                 write_json(out, rows)
     else:
         rows = json.loads(paths[0].read_text("utf-8"))
-    print(choosing(rows), judging(rows), binocular(rows), failures(rows), sep="\n\n")
+    print(
+        choosing(rows), second(rows), second(rows, (0, 1)), judging(rows), binocular(rows), failures(rows), sep="\n\n"
+    )
 
 
 def candidate(config: TrainConfig) -> str:
@@ -96,10 +111,12 @@ def candidate(config: TrainConfig) -> str:
     """
     if config.analytic:
         return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
+    if config.opacity_decay < 1 and config.guard:
+        values = {name: (getattr(config, field), value) for name, (field, value) in _SECOND.items()}
+        changes = [name for name, (x, value) in values.items() if (value in x if isinstance(x, str) else x == value)]
+        return " + ".join(changes) or CHOSEN
     if "warp" in config.loss:
         return "Binocular3DGS" + (", dropout" if config.dropout else "")
-    if config.opacity_decay < 1:
-        return CHOSEN
     return "dropout" if config.dropout else "noise" if config.noise else "plain"
 
 
@@ -125,7 +142,7 @@ def choosing(rows: Sequence[Row]) -> str:
     """Return the table of the candidates: held-out PSNR of seed 0 by scene, and their mean over the scenes of all."""
     of: dict[str, dict[str, Row]] = defaultdict(dict)
     for row in rows:
-        if row["seed"] == 0 and "held-out" in row:
+        if row["seed"] == 0 and "held-out" in row and not _is_second(row["candidate"]):
             of[row["candidate"]][row["scene"]] = row
     shared = [scene for scene in SCENES if sum(scene in found for found in of.values()) == len(of)]
     lines = []
@@ -137,6 +154,26 @@ def choosing(rows: Sequence[Row]) -> str:
     return f"Held-out PSNR in dB, seed 0; mean over {', '.join(shared)}\n\n" + markdown_table(
         [dict.fromkeys(columns, "-") | line for line in lines], columns
     )
+
+
+def second(rows: Sequence[Row], seeds: Sequence[int] = (0,)) -> str:
+    """Return the table of the second choice: gains at held-out views over the mean of the chosen one's seeds."""
+    lines = []
+    for name in (x for x in dict.fromkeys(row["candidate"] for row in rows) if _is_second(x)):
+        line, gains = {"candidate": name}, list[float]()
+        for scene in SCENES:
+            own, found = (
+                {seed: row["held-out"] for seed, row in _of(rows, scene, x).items() if "held-out" in row}
+                for x in (CHOSEN, name)
+            )
+            if own and all(seed in found for seed in seeds):
+                reference = fmean(x for seed, x in own.items() if seed < SEEDS)
+                gains.append(fmean(found[seed] for seed in seeds) - reference)
+                line[scene] = f"{gains[-1]:+.2f}"
+        if gains:
+            lines.append(line | {"mean": f"{fmean(gains):+.2f}", "scenes": str(len(gains))})
+    columns = ["candidate", *(s for s in SCENES if any(s in line for line in lines)), "mean", "scenes"]
+    return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 
 
 def judging(rows: Sequence[Row], references: Path = REFERENCES) -> str:
@@ -229,6 +266,10 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     shares = [f"{name}: {_share(of)} fail" for name, of in counts.items()]
     together = [*shares, f"{CHOSEN} below plain, same seed: {_share(below)}"]
     return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {line}" for line in together)])
+
+
+def _is_second(candidate: str) -> bool:
+    return set(candidate.split(" + ")) <= _SECOND.keys()
 
 
 def _share(of: Sequence[bool]) -> str:
