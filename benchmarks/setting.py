@@ -41,6 +41,7 @@ Row = dict[str, Any]
 _SECOND: dict[str, tuple[str, Any]] = {
     "until 2,000": ("densify_until", 2_000),
     "from 500": ("densify_from", 500),
+    "from 1,000": ("densify_from", 1_000),
     "no reset": ("opacity_reset_every", 0),
     "rate 0.3": ("dropout", 0.3),
     "threshold 2e-4": ("densify_gradient", 2e-4),
