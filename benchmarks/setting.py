@@ -26,6 +26,8 @@ from benchmarks.guard import OTHER_EXPOSURE, quality
 from benchmarks.paper.rows import Rows, value
 from benchmarks.paper.scenes import SCENES
 from benchmarks.remedy import held_out
+from reference_trainer.evaluation.lpips import LPIPS, load_lpips
+from reference_trainer.evaluation.metrics import on_white
 from reference_trainer.evaluation.results import write_json
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 from reference_trainer.json_files import read_json
@@ -79,6 +81,7 @@ def main(
     what: Annotated[Literal["measure", "table"], tyro.conf.Positional],
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
     out: Path = Path("runs/setting.json"),
+    lpips: Path | None = None,
 ) -> None:
     """Measure runs, or print the tables of what was measured.
 
@@ -86,6 +89,7 @@ def main(
         what: "measure", or "table".
         paths: folders of runs, or one file of rows.
         out: the file of rows, which is continued.
+        lpips: weights of the perceptual metric, for runs that were trained without.
     """
     torch.set_num_threads(1)
     if what == "measure":
@@ -94,7 +98,7 @@ def main(
         for run in paths:
             options, config = read_run_settings(run / "config.json")
             if (Path(options.path).name, candidate(config), config.seed) not in known:
-                rows.append(measured(run))
+                rows.append(measured(run, load_lpips(lpips)))
                 write_json(out, rows)
     else:
         rows = json.loads(paths[0].read_text("utf-8"))
@@ -121,8 +125,8 @@ def candidate(config: TrainConfig) -> str:
     return "dropout" if config.dropout else "noise" if config.noise else "plain"
 
 
-def measured(run: Path) -> Row:
-    """Return the row of a finished training."""
+def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
+    """Return the row of a finished training, with the perceptual metric if it has not been measured."""
     model, scene = load_run_model(run)
     options, config = read_run_settings(run / "config.json")
     results = read_json(run / "results.json")
@@ -131,9 +135,14 @@ def measured(run: Path) -> Row:
     if name != "lego" and row["candidate"] not in _REFERENCES:  # lego has no other photographs
         others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(name, ())]
         row["held-out"] = fmean(quality(model, view) for view in others)
-    test = results["mean"]["test"]
+    test, metric = results["mean"]["test"], results.get("perceptual_metric")
+    if metric is None and perceptual is not None:
+        shown = [
+            (on_white(model.test_rendering(v).image.clamp(0, 1), v.mask), on_white(v.image, v.mask)) for v in scene.test
+        ]
+        test["lpips"], metric = fmean(perceptual(*pair) for pair in shown), perceptual.name
     row |= {"test": {x: test[x] for x in _FIGURES if x in test}, "gaussians": results["gaussians"],
-            "seconds": results["processor_seconds"], "lpips": results.get("perceptual_metric"),
+            "seconds": results["processor_seconds"], "lpips": metric,
             "cpu": results["machine"]["cpu"]}  # fmt: skip
     print(scene.name, row["candidate"], row["seed"], row.get("held-out"), row["test"], flush=True)
     return row
@@ -177,15 +186,17 @@ def second(rows: Sequence[Row], seeds: Sequence[int] = (0,)) -> str:
     return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 
 
-def judging(rows: Sequence[Row], references: Path = REFERENCES) -> str:
-    """Return the table of the chosen one against plain 3DGS and dropout alone at the test views, and the goals."""
+def judging(rows: Sequence[Row], references: Path = REFERENCES, *, chosen: str = CHOSEN) -> str:
+    """Return the table of a setting against plain 3DGS and dropout alone at the test views, and the goals."""
     lines, perceptual, counts, spreads = [], list[float](), list[float](), list[float]()
-    gains = differences(rows, references)
+    gains = differences(rows, references, chosen=chosen)
     for scene, pairs in gains.items():
-        known = _references(rows, references, scene)
-        compared = {"plain": known["plain"], "dropout": known["dropout"], CHOSEN: _of(rows, scene, CHOSEN)}
-        compared = {name: {seed: row for seed, row in of.items() if seed < SEEDS} for name, of in compared.items()}
-        _, dropout, own = compared.values()
+        known = _references(rows, references, scene) | {name: _of(rows, scene, name) for name in (CHOSEN, chosen)}
+        compared = {
+            name: {seed: row for seed, row in known[name].items() if seed < SEEDS}
+            for name in dict.fromkeys(("plain", "dropout", CHOSEN, chosen))
+        }
+        dropout, own = compared["dropout"], compared[chosen]
         perceptual.append(_mean(own, "test lpips") - _mean(dropout, "test lpips"))
         counts.append(_mean(own, "gaussians") / _mean(dropout, "gaussians"))
         spreads.append(mean_std(value(row, "test psnr") for row in own.values())[1])
@@ -199,7 +210,7 @@ def judging(rows: Sequence[Row], references: Path = REFERENCES) -> str:
         line["Gaussians over dropout's"] = f"{counts[-1]:.2f}"
         lines.append(line)
     if not lines:
-        return f"Nothing of {CHOSEN!r} was measured."
+        return f"Nothing of {chosen!r} was measured."
     every = [gain for pairs in gains.values() for gain in pairs]
     goals = [
         f"mean gain over plain: {fmean(every):+.2f} dB over {len(every)} pairs of {len(lines)} scenes",
@@ -211,11 +222,11 @@ def judging(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {goal}" for goal in goals)])
 
 
-def differences(rows: Sequence[Row], references: Path = REFERENCES) -> dict[str, list[float]]:
-    """Return by how much the chosen one is ahead of the plain training of the same seed, test PSNR, by scene."""
+def differences(rows: Sequence[Row], references: Path = REFERENCES, *, chosen: str = CHOSEN) -> dict[str, list[float]]:
+    """Return by how much a setting is ahead of the plain training of the same seed, test PSNR, by scene."""
     found: dict[str, list[float]] = {}
     for scene in SCENES:
-        own, plain = _of(rows, scene, CHOSEN), _references(rows, references, scene)["plain"]
+        own, plain = _of(rows, scene, chosen), _references(rows, references, scene)["plain"]
         if shared := sorted(own.keys() & plain.keys() & set(range(SEEDS))):
             found[scene] = [value(own[seed], "test psnr") - value(plain[seed], "test psnr") for seed in shared]
     return found
