@@ -226,7 +226,7 @@ def _gradients(
     The second has shape (M, 3) if ``complete``, else (M, 0).
     """
     rows = table.new_empty(lists.gaussians.shape[0], 12 if complete else 9)
-    to_background = torch.empty_like(background)
+    to_background = tiles.whole_tiles(lists, 3)  # contiguous, which a background need not be
     assert lists.slots is not None
     kernel = _complete_backward if complete else _backward
     tiles.over_tiles(kernel, lists, lists.slots, table, background, *upstream, rows, to_background)

@@ -85,6 +85,20 @@ def test_gradients_equal_autograd_through_the_closed_form(behind, case):
         case.same_gradient(mine, other)
 
 
+def test_a_background_whose_channels_lie_last_has_the_same_gradient(case):
+    """The picture is one of whole tiles, which no engine has to pad, and so to copy."""
+    scene = random_scene(30, 16, 8, seed=8, size=0.2).to(case.dtype)
+    splats = splat(*scene[:4], scene.camera, colors=scene.colors)
+    behind = backdrop(8, 16).to(case.dtype)
+    gradients = []
+    for background in (behind.clone(), behind.permute(1, 2, 0).contiguous().permute(2, 0, 1)):
+        background.requires_grad_()
+        moments = render_moments(splats, Multiplier.dropout(0.3), background=background)
+        (moments.mean.square().sum() + moments.variance.sum()).backward()
+        gradients.append(background.grad)
+    assert torch.equal(*gradients)
+
+
 def test_gradients_in_a_color_or_a_variance_alone(case):
     """Upstream gradients that are absent, or are zero but for one image."""
     scene = random_scene(30, 19, 13, seed=8, size=0.2)
