@@ -15,7 +15,8 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from reference_trainer.render.splats import Engine, Splats
+from reference_trainer.camera import Camera
+from reference_trainer.render.splats import Engine, Projected, Splats
 from reference_trainer.render.torch.engine import TorchEngine
 
 __all__ = [
@@ -127,7 +128,7 @@ class _CompiledEngine:
     or in one order where PyTorch is asked for deterministic ones.
     """
 
-    project: Any
+    _project: Any
     bin: Any
     composite: Any
     composite_masks: Any
@@ -138,14 +139,24 @@ class _CompiledEngine:
     def __init__(self, name: str) -> None:
         self.name = name
         for module, functions in {
-            "projection": ("project",),
+            "projection": ("_project",),
             "binning": ("bin",),
             "compositing": ("composite", "composite_masks", "absolute_gradients"),
             "moments": ("moments", "shares"),
         }.items():
             found = importlib.import_module(f"reference_trainer.render.{name}.{module}")
             for function in functions:
-                setattr(self, function, getattr(found, {"bin": "bin_gaussians"}.get(function, function)))
+                setattr(self, function, getattr(found, {"bin": "bin_gaussians"}.get(function, function.lstrip("_"))))
+
+    def project(self, inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
+        """Project the Gaussians; refuse a pose that waits for a gradient, which none of the kernels computes."""
+        if torch.is_grad_enabled() and camera.world_to_camera.requires_grad:
+            raise NotImplementedError(
+                f"the engine {self.name} has no gradient of the camera's pose: use_engine('torch') has, or detach "
+                "world_to_camera."
+            )
+        projected: Projected = self._project(inputs, camera, degree)
+        return projected
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
         """Keep the lists: what is too faint is skipped."""

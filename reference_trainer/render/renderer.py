@@ -39,6 +39,7 @@ def splat(
             shape, or the world coordinates are too large for their precision, see `MAX_ROUNDING`.
         NotFiniteError: if an input that affects the view is nan or infinite. Of Gaussians behind
             the camera, or dropped, only position and opacity must be finite.
+        NotImplementedError: if the camera's pose requires a gradient, which the engine torch alone computes.
     """
     values, degree = checked_colors(sh, sh_degree, colors)
     n = means.shape[0]
@@ -106,7 +107,8 @@ def render(
         Image, accumulated alpha, depth if asked for, and the splats.
 
     Raises:
-        TypeError, ValueError, NotFiniteError: as `splat`; the last two also for the background.
+        TypeError, ValueError, NotFiniteError, NotImplementedError: as `splat`; the second and third also for the
+            background.
 
     Example:
         >>> camera = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)

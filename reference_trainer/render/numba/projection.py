@@ -351,7 +351,7 @@ class _Project(torch.autograd.Function):
 
 
 def project(inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
-    """Project and color Gaussians, see `Engine.project`."""
+    """Project and color Gaussians, see `Engine.project`; no gradient reaches the camera's pose."""
     depths, indices = visible(inputs, camera)
     # Plain colors are passed as coefficients (N, 1, 3) of degree -1.
     sh, band = (inputs["colors"][:, None], -1) if degree is None else (inputs["sh"], degree)

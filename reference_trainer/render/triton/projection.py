@@ -377,14 +377,8 @@ def _rows(x: Tensor) -> Tensor:
 
 
 def project(inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
-    """Project and color Gaussians, see `Engine.project`.
-
-    Raises:
-        NotImplementedError: if the camera's pose requires a gradient, which this engine does not compute.
-    """
+    """Project and color Gaussians, see `Engine.project`; no gradient reaches the camera's pose."""
     view, means, opacities = camera.world_to_camera, inputs["means"], inputs["opacities"]
-    if view.requires_grad:
-        raise NotImplementedError("the engine triton has no gradient of the camera's pose: use_engine('torch') has.")
     count = len(means)
     visible = torch.empty(count, dtype=torch.bool, device=means.device)
     numbers = torch.zeros(2 + 16, dtype=torch.float64, device=means.device)

@@ -1,6 +1,7 @@
 """The renderer against the brute-force float64 renderer."""
 
 import functools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -278,6 +279,23 @@ def test_a_second_derivative_is_refused(case):
     (slope,) = torch.autograd.grad(image.square().sum(), opacities, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         slope.sum().backward()
+
+
+def test_a_pose_has_its_gradient_or_is_refused(case):
+    """Loops and kernels have none: a pose that is optimized would stay where it is, without a word."""
+    scene = random_scene(20, 9, 7, seed=5, size=0.3).to(case.dtype)
+    pose = scene.camera.world_to_camera.clone().requires_grad_()
+    moving = replace(scene.camera, world_to_camera=pose)
+    means = scene.means.clone().requires_grad_()
+    if case.engine == "torch":
+        render(means, *scene[1:4], moving, colors=scene.colors).image.square().sum().backward()
+        assert pose.grad.any()
+    else:
+        with pytest.raises(NotImplementedError, match=rf"{case.engine} has no gradient of the camera's pose: .*torch"):
+            render(means, *scene[1:4], moving, colors=scene.colors)
+    with torch.no_grad():  # as when such a pose is looked at
+        still = render(means, *scene[1:4], moving, colors=scene.colors).image
+    assert torch.equal(still, render(*scene[:4], scene.camera, colors=scene.colors).image)
 
 
 def test_an_input_that_was_changed_before_the_backward_pass_does_not_falsify_it(case):
