@@ -8,7 +8,6 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
 from typing import Any
 from unittest.mock import patch
 
@@ -115,10 +114,11 @@ def describe_engine(device: torch.device | str) -> str:
     name = engine_for(torch.device(device)).name
     if name == "torch":
         return name
+    version = importlib.import_module(name).__version__  # Triton is distributed by other names too: pytorch-triton-rocm
     if name == "triton":
-        return f"triton ({version('triton')}{', interpreted' if torch.device(device).type == 'cpu' else ''})"
+        return f"triton ({version}{', interpreted' if torch.device(device).type == 'cpu' else ''})"
     count = torch.get_num_threads()
-    return f"numba ({version('numba')}, {count} thread{'s' if count > 1 else ''})"
+    return f"numba ({version}, {count} thread{'s' if count > 1 else ''})"
 
 
 class _CompiledEngine:

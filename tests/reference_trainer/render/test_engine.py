@@ -1,6 +1,7 @@
 """Which engine renders, and the choice of the user afterwards."""
 
 import os
+from importlib.metadata import Distribution, PackageNotFoundError
 from importlib.util import find_spec
 
 import pytest
@@ -45,6 +46,20 @@ def test_the_line_that_says_which():
     )  # also where there is no card, as before a sweep on other machines
     use_engine("torch")
     assert describe_engine("cpu") == "torch"
+
+
+def test_the_line_of_a_triton_that_came_by_another_name(monkeypatch):
+    """As with PyTorch for AMD's cards, for Windows, and every night: pytorch-triton-rocm, triton-windows."""
+    triton = pytest.importorskip("triton")
+    found = Distribution.from_name
+
+    def from_name(name):
+        if name == "triton":
+            raise PackageNotFoundError(name)
+        return found(name)
+
+    monkeypatch.setattr(Distribution, "from_name", from_name)
+    assert describe_engine("cuda") == f"triton ({triton.__version__})"
 
 
 def test_an_engine_that_does_not_exist(monkeypatch):
