@@ -34,11 +34,27 @@ def test_in_single_precision_the_center_stays_the_center(settings_of):
     assert abs(found.cy - 150) < 1e-3
 
 
-@pytest.mark.parametrize("mistake", ["transposed", "field of view"])
+@pytest.mark.parametrize("far", [3e4, 1e5])
+def test_in_single_precision_a_camera_far_from_the_origin_is_a_pinhole_camera(far, settings_of):
+    """As of a town in meters: the fourth row of the matrices' product is as large, and rounds so."""
+    camera = random_scene(1, 500, 300, seed=1).camera
+    pose = camera.world_to_camera.float()
+    pose[:3, 3] = far * torch.tensor([1.0, 0.3, -0.2])
+    for focal in (311.0, 407.0, 533.0, 619.0):
+        found = camera_of(settings_of(type(camera)(pose, focal, focal, 250.0, 150.0, 500, 300)))
+        assert abs(found.cx - 250) < 1e-3
+        assert abs(found.cy - 150) < 1e-3
+
+
+@pytest.mark.parametrize("mistake", ["transposed", "field of view", "moved"])
 def test_matrices_that_disagree_are_refused(settings_of, mistake):
     settings = settings_of(random_scene(1, 40, 24, seed=1).camera)
     if mistake == "transposed":
         settings = settings._replace(viewmatrix=settings.viewmatrix.T, projmatrix=settings.projmatrix.T)
+    elif mistake == "moved":
+        moved = settings.viewmatrix.clone()
+        moved[3, :2] += 0.01
+        settings = settings._replace(viewmatrix=moved)
     else:
         settings = settings._replace(tanfovx=1.1 * settings.tanfovx)
     with pytest.raises(ValueError, match="pinhole camera"):
