@@ -47,7 +47,10 @@ _TELLING_NOTHING = re.compile(r"^(.*\.)?((rendered|render|rend|out)_)?|_(image|i
 
 
 class Unknown:
-    """Takes the place of a value that the stand-in cannot compute; whatever is done with it raises ValueError."""
+    """Takes the place of a value that the stand-in cannot compute; whatever is done with it raises ValueError.
+
+    It may be handed on, and compared with None, as many scripts do with what a rasterizer may lack.
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -72,6 +75,23 @@ class Unknown:
         lists = [x for value in values if isinstance(value, list | tuple) for x in value]
         next(x for x in values + lists if isinstance(x, cls))._refuse()
 
+    def __eq__(self, other: object) -> bool:
+        """Refuse a comparison, but with None."""
+        if other is not None:
+            self._refuse()
+        return False
+
+    __hash__ = object.__hash__
+
+
+# Python looks for these at the class, and would say that the class has none of them.
+for _operator in (
+    "add", "radd", "sub", "rsub", "mul", "rmul", "truediv", "rtruediv", "floordiv", "rfloordiv", "mod", "rmod", "pow",
+    "rpow", "matmul", "rmatmul", "and", "rand", "or", "ror", "xor", "rxor", "neg", "abs", "invert", "lt", "le", "gt",
+    "ge", "bool", "int", "float", "index", "len", "iter", "getitem", "setitem", "array",
+):  # fmt: skip
+    setattr(Unknown, f"__{_operator}__", Unknown._refuse)
+
 
 class Picture(Tensor):
     """Planes (C, H, W) that raise ValueError when asked for a channel that they lack.
@@ -91,10 +111,6 @@ class Picture(Tensor):
                 f"channels: {SAY_IT}; what is none of these needs CUDA."
             )
         return super().__getitem__(index)
-
-
-for _operator in ("getitem", "len", "iter", "bool", "gt", "lt", "add", "mul", "truediv", "radd", "rmul", "neg"):
-    setattr(Unknown, f"__{_operator}__", Unknown._refuse)
 
 
 def kinds_of(names: tuple[str, ...] | None, fields: set[str]) -> tuple[str | None, ...]:

@@ -1,5 +1,8 @@
 """What the values of a rasterizer are taken for, and what happens to those that are not known."""
 
+import operator
+
+import numpy as np
 import pytest
 import torch
 
@@ -62,15 +65,36 @@ def test_what_nothing_tells_is_asked_for():
         lambda x: torch.stack([torch.ones(3), x]),
         lambda x: torch.relu(input=x),
         lambda x: x > 0,
+        lambda x: x >= 0,
+        lambda x: x == 0,
+        lambda x: x != 0,
+        lambda x: 1 - x,
+        lambda x: x - 1,
+        lambda x: 1 / x,
+        lambda x: x**2,
+        lambda x: ~x,
+        lambda x: x & True,
+        lambda x: operator.setitem(x, 0, 1),
+        abs,
         bool,
+        float,
+        int,
         len,
         list,
+        np.asarray,
     ],
 )
 def test_an_unknown_value_is_refused_once_it_is_used(use):
     held = {"kept": Unknown("counts")}["kept"]
     with pytest.raises(ValueError, match=r"output counts is used, .* --outputs"):
         use(held)
+
+
+def test_an_unknown_value_is_not_none():
+    unknown = Unknown("counts")
+    assert unknown != None  # noqa: E711
+    assert (unknown == None) is False  # noqa: E711
+    assert {unknown: 1}[unknown] == 1
 
 
 @pytest.mark.parametrize("index", [3, slice(3, 6), slice(2, 5), (8, slice(None)), (slice(3, None), 0), (7, ..., None)])
