@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import functools
 import inspect
 import linecache
@@ -96,7 +97,8 @@ for _operator in (
 class Picture(Tensor):
     """Planes (C, H, W) that raise ValueError when asked for a channel that they lack.
 
-    A slice beyond the end of a plain tensor would silently be empty. Results computed from planes are plain tensors.
+    A slice beyond the end of a plain tensor would silently be empty. Results computed from planes are plain tensors; so
+    are deep copies, and what is loaded from a file.
     """
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
@@ -111,6 +113,14 @@ class Picture(Tensor):
                 f"channels: {SAY_IT}; what is none of these needs CUDA."
             )
         return super().__getitem__(index)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Tensor:
+        """Return what a tensor would, which does not know how to make a subclass anew."""
+        return copy.deepcopy(self.as_subclass(Tensor), memo)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Be kept as a tensor, which loads without this package, and with ``weights_only``."""
+        return self.as_subclass(Tensor).__reduce_ex__(protocol)
 
 
 def kinds_of(names: tuple[str, ...] | None, fields: set[str]) -> tuple[str | None, ...]:

@@ -1,5 +1,6 @@
 """What the values of a rasterizer are taken for, and what happens to those that are not known."""
 
+import copy
 import operator
 
 import numpy as np
@@ -111,3 +112,12 @@ def test_a_picture_is_a_tensor_otherwise():
     assert type(picture * 1) is type(picture.detach()) is torch.Tensor
     picture[0].sum().backward()
     assert torch.equal(plain.grad, torch.tensor([2.0, 0, 0])[:, None, None].expand(3, 4, 5))
+
+
+def test_a_picture_is_copied_and_kept_as_a_tensor(tmp_path):
+    picture = torch.rand(3, 4, 5).as_subclass(Picture)
+    torch.save({"render": picture}, tmp_path / "render.pt")
+    for other in (copy.deepcopy(picture), torch.load(tmp_path / "render.pt", weights_only=True)["render"]):
+        assert type(other) is torch.Tensor
+        assert torch.equal(other, picture)
+        assert other.data_ptr() != picture.data_ptr()
