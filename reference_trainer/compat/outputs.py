@@ -120,7 +120,7 @@ class Picture(Tensor):
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Be kept as a tensor, which loads without this package, and with ``weights_only``."""
-        return self.as_subclass(Tensor).__reduce_ex__(protocol)
+        return self.as_subclass(Tensor).__reduce_ex__(protocol)  # type: ignore[no-untyped-call]
 
 
 def kinds_of(names: tuple[str, ...] | None, fields: set[str]) -> tuple[str | None, ...]:
