@@ -25,23 +25,23 @@ SAY_IT = (
     "that share one as its channels: image+normal+depth+alpha+distortion,radii"
 )
 _SURFELS = "depth+alpha+normal+mean_depth+distortion"  # seven planes of 2DGS
-_NAMES = {
-    "image": {"image", "color", "colour", "rgb"},
-    "radii": {"radii"},
-    "depth": {"depth"},
-    "inverse_depth": {"inverse_depth", "inv_depth", "invdepth", "inverse_depths", "inv_depths", "invdepths"},
-    "alpha": {"alpha", "alphas", "acc", "accumulation", "opacity", "silhouette"},
-    "normal": {"normal", "normals"},
-    "mean_depth": {"mean_depth"},
-    "distortion": {"distortion"},
-    "weights": {"weights", "gs_w"},
-    "pixels": {"pixels"},
+_NAMES: dict[str, set[str]] = {  # further names of each kind
+    "image": {"color", "colour", "rgb"},
+    "radii": set(),
+    "depth": set(),
+    "inverse_depth": {"inv_depth", "invdepth", "inverse_depths", "inv_depths", "invdepths"},
+    "alpha": {"alphas", "acc", "accumulation", "opacity", "silhouette"},
+    "normal": {"normals"},
+    "mean_depth": set(),
+    "distortion": set(),
+    "weights": {"gs_w"},
+    "pixels": set(),
     "metric_counts": {"accum_metric_counts"},
     "heaviest": {"max_weights_idx"},
     "largest_weight": {"max_weights"},
     _SURFELS: {"surfels", "allmap"},
 }
-_KINDS = {name: kind for kind, names in _NAMES.items() for name in names}
+_KINDS = {name: kind for kind, names in _NAMES.items() for name in (kind, *names)}
 _SCORES = {"accum_weights", "accum_count", "accum_blend", "accum_dist", "depths", "my_radii"}  # by Taming 3DGS's names
 # Prefixes and suffixes that say only that a value was rendered, or that it is a picture.
 _TELLING_NOTHING = re.compile(r"^(.*\.)?((rendered|render|rend|out)_)?|_(image|img|map)$")

@@ -2,12 +2,13 @@
 
 import copy
 import operator
+import re
 
 import numpy as np
 import pytest
 import torch
 
-from reference_trainer.compat.outputs import Picture, Unknown, kinds_of
+from reference_trainer.compat.outputs import SAY_IT, Picture, Unknown, kinds_of
 
 
 @pytest.mark.parametrize(
@@ -47,6 +48,15 @@ def test_values_are_told_by_their_names_and_by_the_settings(names, fields, kinds
 )
 def test_image_and_radii_are_where_their_names_are(names, kinds):
     assert kinds_of(tuple(names.split(", ")), set()) == kinds
+
+
+def test_every_kind_that_the_advice_lists_can_be_said():
+    listed = re.search(r"of (depth, .*? and \w+), and \+", SAY_IT)[1]
+    names = tuple(re.split(r", | and ", listed))
+    assert {"depth", "heaviest", "largest_weight"} <= set(names)
+    kinds = kinds_of(("image", "radii", *names), set())
+    assert None not in kinds
+    assert len(set(kinds)) == len(kinds)
 
 
 def test_what_nothing_tells_is_asked_for():
