@@ -87,7 +87,8 @@ def make_rasterization(original: Rasterization, *, per_axis: bool) -> Rasterizat
                 _refuse(name, f"got {_describe(value)}: leave it at {default!r}")
         given = SimpleNamespace(**bound.arguments)
         _check(given)
-        return _rasterize(given, per_axis)
+        with torch.autocast(given.means.device.type, enabled=False):  # which gsplat's kernels do not know
+            return _rasterize(given, per_axis)
 
     return rasterization
 
@@ -292,7 +293,8 @@ def quat_scale_to_covar_preci(
     axes = rotation_matrices(quats)
 
     def product(lengths: Tensor) -> Tensor:
-        matrix = (axes * lengths[:, None]) @ (axes * lengths[:, None]).mT
+        with torch.autocast(lengths.device.type, enabled=False):
+            matrix = (axes * lengths[:, None]) @ (axes * lengths[:, None]).mT
         return matrix.flatten(1)[:, [0, 1, 2, 4, 5, 8]] if triu else matrix
 
     return product(scales) if compute_covar else None, product(1 / scales) if compute_preci else None

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from types import ModuleType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +21,8 @@ from reference_trainer.render.constants import DILATION
 from reference_trainer.render.densification import in_front, splat_weights, visible_radii, with_absolute_gradients
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "camera_of", "rasterizer_module"]
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 TOLERANCE = 1e-3  # of the entries of a projection matrix that went through single precision twice
 ROUNDING = 1e-6  # of what is 0 there, but is a difference of numbers as large as the camera is far from the origin
@@ -131,6 +133,17 @@ FLOOR = 2.5e-5  # least ratio of determinants in INRIA's antialiasing
 FLOOR_OF_MIP = 1e-6  # the same in Mip-Splatting
 
 
+def _without_autocast(method: F) -> F:
+    """Let a method of a rasterizer compute in the precision of its arguments, as CUDA code does."""
+
+    @functools.wraps(method)
+    def precise(self: GaussianRasterizer, *args: Any, **kwargs: Any) -> Any:
+        with torch.autocast(self.raster_settings.viewmatrix.device.type, enabled=False):
+            return method(self, *args, **kwargs)
+
+    return cast("F", precise)
+
+
 class GaussianRasterizer(nn.Module):
     """Renders one view as a rasterizer of the INRIA family would.
 
@@ -152,10 +165,12 @@ class GaussianRasterizer(nn.Module):
         super().__init__()
         self.raster_settings = raster_settings
 
+    @_without_autocast
     def markVisible(self, positions: Tensor) -> Tensor:
         """Say which points (N, 3) lie beyond the near plane; shape (N,) bool."""
         return in_front(positions, camera_of(self.raster_settings))
 
+    @_without_autocast
     def visible_filter(
         self, means3D: Tensor, scales: Tensor, rotations: Tensor, cov3D_precomp: Tensor | None = None
     ) -> Tensor:
@@ -163,6 +178,7 @@ class GaussianRasterizer(nn.Module):
         scales, rotations = self._axes(scales, rotations, cov3D_precomp)
         return visible_radii(means3D, rotations, scales, camera_of(self.raster_settings))
 
+    @_without_autocast
     def forward(
         self,
         means3D: Tensor,

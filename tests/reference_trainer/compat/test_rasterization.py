@@ -8,7 +8,7 @@ import torch
 from oracles import random_scene
 from stand_ins.gsplat import centered, intrinsics
 
-from reference_trainer.compat.gsplat import make_rasterization
+from reference_trainer.compat.gsplat import make_rasterization, quat_scale_to_covar_preci
 
 rendering = pytest.importorskip("gsplat.rendering")
 own = pytest.importorskip("gsplat.cuda._torch_impl")
@@ -126,6 +126,16 @@ def test_in_single_precision_the_engine_of_the_machine_draws_the_same():
     for image in images:
         image.sum().backward()
     torch.testing.assert_close(leaves[1].grad.double(), leaves[0].grad, rtol=1e-3, atol=2e-2)
+
+
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_mixed_precision_changes_nothing(mode):
+    """As with gsplat's kernels, which know float32 alone."""
+    a = given(dtype=torch.float32, rasterize_mode=mode, eps2d=0.1)
+    plain = [*rasterization(**a)[:2], *quat_scale_to_covar_preci(a["quats"], a["scales"])]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        cast = [*rasterization(**a)[:2], *quat_scale_to_covar_preci(a["quats"], a["scales"])]
+    assert all(torch.equal(one, other) for one, other in zip(plain, cast, strict=True))
 
 
 @pytest.mark.parametrize("packed", [True, False])

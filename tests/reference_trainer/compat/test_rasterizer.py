@@ -121,6 +121,21 @@ def test_nothing_in_view_is_the_background_with_zero_gradients(settings_of, coun
     assert torch.equal(screen.grad, torch.zeros(count, 3).double())
 
 
+def test_mixed_precision_changes_nothing(settings_of):
+    """As of the CUDA code, whose kernels know float32 alone."""
+    scene = random_scene(200, 40, 30, seed=6, size=0.2).to(torch.float32)
+    settings = settings_of(scene.camera, antialiasing=True, pixel_weights=torch.rand(30, 40))
+    members = (*DEPTH_ALPHA, "normal", "mean_depth", "distortion", "weights", "pixels", "heaviest", "largest_weight")
+    rasterizer = rasterizer_module(NAME).GaussianRasterizer(settings)
+    axes = scene.means, scene.scales, scene.quaternions
+    plain = [*_call(settings, scene, members), rasterizer.visible_filter(*axes), rasterizer.markVisible(axes[0])]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        cast = [*_call(settings, scene, members), rasterizer.visible_filter(*axes), rasterizer.markVisible(axes[0])]
+    for one, other in zip(plain, cast, strict=True):
+        assert one.dtype == other.dtype
+        assert torch.equal(one, other)
+
+
 def test_single_precision_as_the_repositories_use_it(settings_of):
     scene = random_scene(100, 40, 30, seed=6)
     slow = brute_force(*scene)[0]
