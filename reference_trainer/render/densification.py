@@ -77,10 +77,10 @@ def visible_radii(
 def splat_weights(splats: Splats) -> Tensor:
     """Sum every splat's alpha times transmittance over the pixels of the image, shape (M,)."""
     # The image is linear in the colors: the gradient of the sum of red is the sum of the weights.
-    colors = torch.zeros_like(splats.colors).requires_grad_()
-    with torch.enable_grad():
+    with torch.inference_mode(False), torch.enable_grad():  # inference mode would record no gradient
+        colors = torch.zeros_like(splats.colors).requires_grad_()
         red = rasterize(splats._replace(colors=colors)).image[0].sum()
-    return torch.autograd.grad(red, colors)[0][:, 0]
+        return torch.autograd.grad(red, colors)[0][:, 0]
 
 
 class _AbsoluteGradients(torch.autograd.Function):

@@ -150,11 +150,12 @@ class TorchEngine:
 
     def shares(self, splats: Splats, multiplier: Tensor, background: Tensor, weights: Tensor) -> Tensor:
         """Differentiate the variance with respect to factors on its summands."""
-        with torch.enable_grad():
+        with torch.inference_mode(False), torch.enable_grad():  # inference mode would record no gradient
             factors = torch.ones_like(splats.opacities)[None].requires_grad_()
-            variance = self._moments(splats, multiplier, background, factors).variance
-            total = (variance.mean(0) * weights).sum()
-        return torch.autograd.grad(total, factors)[0][0].double()
+            # Copies, as what was made in inference mode cannot be kept for a backward pass.
+            variance = self._moments(splats, multiplier, background.clone(), factors).variance
+            total = (variance.mean(0) * weights.clone()).sum()
+            return torch.autograd.grad(total, factors)[0][0].double()
 
     def _moments(self, splats: Splats, multiplier: Tensor, background: Tensor, factors: Tensor) -> MomentImages:
         rows = torch.cat([geometry_rows(splats), multiplier.T, factors, splats.colors.T])

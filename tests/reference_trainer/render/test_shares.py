@@ -6,6 +6,7 @@ from oracles import random_scene
 
 from ca_reg.functional import Multiplier, contributions
 from reference_trainer.render import render_moments, splat, variance_shares
+from reference_trainer.render.densification import splat_weights
 
 
 def dense_shares(splats, multiplier, weights, background):
@@ -60,3 +61,17 @@ def test_weights_of_another_size_are_refused(case):
     splats = splat(*scene[:4], scene.camera, colors=scene.colors)
     with pytest.raises(ValueError, match=r"shape \(7, 9\), got \(9, 7\)"):
         variance_shares(splats, Multiplier.dropout(0.5), torch.ones(9, 7))
+
+
+def test_inference_mode_does_not_keep_the_gradient_away(case):
+    """By which the torch engine finds shares, and every engine the sums of blend weights."""
+    scene = random_scene(30, 19, 13, seed=12).to(case.dtype)
+    found = []
+    for inference in (False, True):
+        with torch.inference_mode(inference):
+            splats = splat(*(x * 1 for x in scene[:4]), scene.camera, colors=scene.colors * 1)
+            weights, background = torch.ones(13, 19, dtype=case.dtype), torch.full((3,), 0.3, dtype=case.dtype)
+            shares = variance_shares(splats, Multiplier.dropout(0.5), weights, background=background)
+            found.append((shares, splat_weights(splats)))
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+    assert all(x.any() for x in found[0])
