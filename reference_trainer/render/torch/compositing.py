@@ -86,9 +86,10 @@ def pixel_offsets(like: Tensor) -> Tensor:
 def geometry_rows(splats: Splats) -> Tensor:
     """Return x, y, l11, l21, l22 and log2 of the opacity of M splats, shape (6, M)."""
     means, factors = splats.projection.means, splats.projection.factors
-    # Splats that a mask drops are in no list: their gradient is 0.
-    opacities = splats.opacities.clamp_min(MIN_ALPHA)
-    return torch.cat([means.T, factors.T, torch.log2(opacities)[None]])
+    # Splats that a mask drops may still be in the lists, of other engines; at `MIN_ALPHA` itself rounding would decide.
+    opacities = splats.opacities
+    log_opacities = torch.where(opacities >= MIN_ALPHA, torch.log2(opacities.clamp_min(MIN_ALPHA)), _ABSENT)
+    return torch.cat([means.T, factors.T, log_opacities[None]])
 
 
 def block_pairs(device: torch.device) -> int:

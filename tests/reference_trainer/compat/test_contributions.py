@@ -3,6 +3,7 @@
 import torch
 from oracles import brute_force, random_scene
 
+from reference_trainer.camera import Camera
 from reference_trainer.compat.rasterizer import rasterizer_module
 from reference_trainer.render.torch.projection import project
 
@@ -45,6 +46,22 @@ def test_pixels_are_those_at_which_a_gaussian_is_drawn(settings_of):
     )  # fmt: skip
     weights, _ = brute_force(*scene[:4], torch.eye(30).double(), scene.camera)
     assert torch.equal(pixels, (weights > 0).sum((1, 2))[:, None].double())
+
+
+def test_what_antialiasing_makes_invisible_is_drawn_at_no_pixel(settings_of):
+    """Specks in the very middle of pixels, as pixel-aligned models have: there alone rounding could decide."""
+    camera = Camera(torch.eye(4), 40.0, 40.0, 20.0, 20.0, 40, 40)
+    rows, columns = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(40) + 0.5, indexing="ij")
+    means = camera.lift(torch.stack([columns, rows], -1), torch.full((40, 40), 2.0)).reshape(-1, 3)
+    module = rasterizer_module("diff_gaussian_rasterization", outputs=("image", "alpha", "radii", "pixels"))
+    _, alpha, radii, pixels = module.GaussianRasterizer(settings_of(camera, antialiasing=True))(
+        means3D=means, means2D=torch.zeros_like(means), opacities=torch.full((1600, 1), 0.5),
+        colors_precomp=torch.ones(1600, 3), scales=torch.full((1600, 3), 1e-5),
+        rotations=torch.eye(4)[:1].repeat(1600, 1),
+    )  # fmt: skip
+    assert (radii > 0).all()
+    assert not alpha.any()
+    assert not pixels.any()
 
 
 def _weights(scene):
