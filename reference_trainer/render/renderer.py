@@ -147,6 +147,9 @@ def render_masks(splats: Splats, opacities: Tensor, *, background: Tensor | None
         Images (K, 3, H, W) and accumulated alphas (K, H, W), without gradients.
     """
     lower = opacities[:, splats.indices].to(splats.opacities.dtype)
+    if not len(lower):
+        size = splats.lists.height, splats.lists.width
+        return lower.new_empty(0, 3, *size), lower.new_empty(0, *size)
     with torch.autocast(lower.device.type, enabled=False):
         return splats.engine.composite_masks(splats, lower, checked_background(background, splats, (3,)))
 

@@ -172,9 +172,10 @@ def test_many_masks_at_once_draw_what_fresh_renders_draw(case):
     factors += [torch.rand(300, generator=g), torch.ones(300), torch.zeros(300), torch.full((300,), 0.02)]
     opacities = scene.opacities * torch.stack([x.to(case.dtype) for x in factors])
     whole = splat(*scene[:4], scene.camera, colors=scene.colors)
-    for some in (opacities, opacities[:2], opacities[1:2]):
+    for some in (opacities, opacities[:2], opacities[1:2], opacities[:0]):
         images, alphas = render_masks(whole, some, background=background)
         assert images.shape == (len(some), 3, 21, 37)
+        assert alphas.shape == (len(some), 21, 37)
         for image, alpha, opacity in zip(images, alphas, some, strict=True):
             fresh = render(*scene[:3], opacity, scene.camera, colors=scene.colors, background=background)
             crossing = (image - fresh.image).abs().amax(0) > 100 * torch.finfo(case.dtype).eps
