@@ -6,8 +6,8 @@ gsplat's ``meta`` (1.4, 1.5, main) holds what the moments need: ``means2d, conic
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping
-from importlib.metadata import version
 from typing import Any
 
 import torch
@@ -103,4 +103,5 @@ class GsplatMoments:
 
 def _max_alpha() -> float:
     """Return where the installed gsplat clamps alphas."""
-    return 0.999 if tuple(int(x) for x in version("gsplat").split(".")[:2]) < (1, 6) else 0.99
+    version = importlib.import_module("gsplat").__version__  # it is distributed by another name too: amd-gsplat
+    return 0.999 if tuple(int(x) for x in version.split(".")[:2]) < (1, 6) else 0.99

@@ -3,6 +3,9 @@
 ``meta`` is made by gsplat's own torch functions, as its kernels need a card.
 """
 
+import sys
+from importlib.metadata import Distribution, PackageNotFoundError
+
 import pytest
 import torch
 from oracles import random_scene
@@ -85,6 +88,28 @@ def test_score_map_and_shares_are_those_of_listed_pixels(package, scene, packed)
         for score, x in zip(scores, (ours, theirs), strict=True)
     )
     assert (mine - listed).abs().max() <= 1e-4 * listed.max()
+
+
+@pytest.mark.parametrize(("version", "clamp"), [("1.5.3", 0.999), ("1.6.0", 0.99)])
+def test_alphas_are_clamped_where_the_gsplat_that_is_there_does_so(package, scene, version, clamp, monkeypatch):
+    """By whatever name it was installed: the one for AMD's cards is amd-gsplat."""
+    found = Distribution.from_name
+
+    def from_name(name):
+        if name == "gsplat":
+            raise PackageNotFoundError(name)
+        return found(name)
+
+    monkeypatch.setattr(Distribution, "from_name", from_name)
+    monkeypatch.setattr(sys.modules["gsplat"], "__version__", version)
+    given = scene.opacities, None, Multiplier.dropout(0.5), None
+    told, itself = (
+        GsplatMoments(lambda opacity, _: (scene.colors, meta_of(package, scene, opacity, False)), max_alpha=clamped)(
+            *given
+        )
+        for clamped in (clamp, None)
+    )
+    assert all(torch.equal(one, other) for one, other in zip(told, itself, strict=True))
 
 
 def test_several_cameras_are_refused(package, scene):
