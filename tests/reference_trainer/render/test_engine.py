@@ -127,10 +127,3 @@ def test_triton_renders_float32_on_a_card_and_if_interpreted_on_a_cpu(monkeypatc
     assert engine_for(torch.device("cpu")).name == "triton"
     assert describe_engine("cpu").startswith("triton ")
     assert describe_engine("cpu").endswith("interpreted)")
-
-
-def test_triton_that_is_missing_is_an_error_only_if_asked_for(monkeypatch):
-    monkeypatch.setattr("reference_trainer.render.engine._compiled_engine", lambda name: None)
-    assert engines_on(torch.device("cuda")) == ("torch",)
-    with pytest.raises(ImportError, match="pip install triton"), using_engine("triton"):
-        pass

@@ -149,14 +149,16 @@ print("loaded:", [name for name in ("numba", "llvmlite") if name in sys.modules]
     assert out.endswith("loaded: []\n")
 
 
-HIDE = """
+def hiding(*packages):
+    """The beginning of a script on a machine without some packages."""
+    return f"""
 import importlib.machinery, sys
 import torch
 
 class Hiding(importlib.machinery.PathFinder):
     @classmethod
     def find_spec(cls, name, path=None, target=None):
-        return None if name.partition(".")[0] in ("numba", "llvmlite") else super().find_spec(name, path, target)
+        return None if name.partition(".")[0] in {packages} else super().find_spec(name, path, target)
 
 sys.meta_path[sys.meta_path.index(importlib.machinery.PathFinder)] = Hiding
 """
@@ -165,7 +167,7 @@ sys.meta_path[sys.meta_path.index(importlib.machinery.PathFinder)] = Hiding
 def test_without_numba_everything_is_there(tmp_path):
     save_few(tmp_path / "start.ply")
     out = run(
-        HIDE
+        hiding("numba", "llvmlite")
         + f"""
 from reference_trainer.cli import main
 out, start = {str(tmp_path / "run")!r}, {str(tmp_path / "start.ply")!r}
@@ -185,6 +187,23 @@ except SystemExit as exit_:
     assert "exact CA" in out
     assert "Nothing is left to compile." in out
     assert out.endswith("code 2\n")
+
+
+def test_triton_that_is_missing_is_an_error_only_if_asked_for():
+    out = run(
+        hiding("triton")
+        + """
+from reference_trainer.render import describe_engine, use_engine
+from reference_trainer.render.engine import engines_on
+print(describe_engine("cuda"), engines_on(torch.device("cuda")))
+try:
+    use_engine("triton")
+except ImportError as error:
+    print(error)
+"""
+    )
+    assert out.startswith("torch ('torch',)\n")
+    assert "pip install triton" in out
 
 
 def test_a_numba_that_cannot_be_imported_is_as_good_as_none(tmp_path):
