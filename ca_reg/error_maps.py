@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ca_reg._check import check_callable, check_opacity, check_rate, check_tensor
+from ca_reg._check import check_callable, check_opacity, check_opacity_range, check_rate, check_tensor
 from ca_reg.functional import Multiplier
 from ca_reg.lists import ListMoments
 from ca_reg.types import Layout, MomentsFn, RenderFn, read_moments, read_rendering
@@ -155,7 +155,7 @@ def error_map(
 
     Raises:
         TypeError: if an argument is of the wrong type.
-        ValueError: if one is out of range, or ``render_fn`` returns no alpha.
+        ValueError: if one is out of range, ``opacity`` looks like logits, or ``render_fn`` returns no alpha.
 
     Example:
         A wall with a hole: what is not covered is expected to be wrong.
@@ -170,6 +170,7 @@ def error_map(
     """
     check_callable(render_fn, "render_fn")
     check_opacity(opacity)
+    check_opacity_range(opacity)
     check_rate(p)
     expected = opacity.detach() * (1 - p)
     image, alpha = read_rendering(render_fn(expected.clone(), view), layout=layout)  # a copy: it may edit them

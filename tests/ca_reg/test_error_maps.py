@@ -157,3 +157,5 @@ def test_errors_say_what_is_missing():
         error_map(lambda opacity, view: torch.zeros(3, 4, 4), torch.ones(2), None)
     with pytest.raises(ValueError, match=r"p must be in \[0, 1\)"):
         error_map(wall, torch.ones(2), None, p=1.0)
+    with pytest.raises(ValueError, match=r"opacity must be activated.*torch.sigmoid"):
+        error_map(wall, torch.tensor([-2.0, 3.0]), None)
