@@ -168,11 +168,13 @@ def _similar_options(heard: str, given: str) -> dict[str, list[str]]:
 
 def _in_a_line(heard: str, arguments: Sequence[str]) -> ValueError | None:
     """Return what tyro says in a box, with inner names and help of other commands, as an error like all others."""
-    heard = re.sub(r"\x1b\[[0-9;]*m", "", heard)
+    heard = re.sub(r"\x1b\[[0-9;]*m|\{None\}\|", "", heard)
     text = " ".join(re.sub(r"[│╭╮╰╯─|]|-{3,}", " ", heard).split()).partition(" For full helptext")[0]
     command = next((word for word in arguments if not word.startswith("-")), "")
     if found := re.search(r"Error parsing \S+: (.*?)( Argument helptext: (\S+) (\S+) .*)?$", text):
-        return ValueError(f"{found[3]} expects {found[4]}: {found[1]}." if found[2] else found[1])
+        # Of an option that has no value by default, tyro first says that what was given is not None.
+        why = re.sub(r"^no type matching .*<class '\w+'>: ", "", found[1])
+        return ValueError(f"{found[3]} expects {found[4]}: {why}." if found[2] else found[1])
     if found := re.search(r"Unrecognized (?:or misplaced )?options: ([^ ,]+)(?:.*Available subcommands: (.*))?", text):
         given, names = found[1].partition("=")[0], (found[2] or "").split(", ")
         near = _similar_options(heard, given)
@@ -185,5 +187,11 @@ def _in_a_line(heard: str, arguments: Sequence[str]) -> ValueError | None:
         return ValueError(f"there is no {given}{meant} All options: ca-reg {'' if found[2] else f'{command} '}--help")
     if found := re.search(r"Missing from .*?: (\S+) (.*) \(required\)", text):
         return ValueError(f"{command} needs {found[1]}: {found[2]} See ca-reg {command} --help")
+    if found := re.search(r"invalid choice (.*?) for argument '(\S+)'. Expected one of \((.*?)\)", text):
+        # tyro lists them in another order every time, and a default of None as if it could be written.
+        choices = sorted({*re.findall(r"'([^']*)'", found[3])} - {"None"})
+        return ValueError(
+            f"{found[2]} must be one of {', '.join(choices)}, got {found[1]}. See ca-reg {command} --help"
+        )
     text = re.sub(r"^.*?(?=invalid choice|Expected one|Missing value)", "", text)
     return ValueError(f"{text} See ca-reg {command} --help") if heard else None
