@@ -207,6 +207,11 @@ def llff_split(count: int, views: int) -> tuple[list[int], list[int]]:
         ([1, 10, 19], [0, 8, 16])
     """
     pool = [i for i in range(count) if i % TEST_EVERY]
+    if views > len(pool):
+        raise ValueError(
+            f"cannot choose {views} training views from the {len(pool)} of {count} photographs that are not held out "
+            f"(every eighth is, from the first on): ask for 1 to {len(pool)}, or hold none out with --test none."
+        )
     return [pool[i] for i in evenly_spaced(len(pool), views)], list(range(0, count, TEST_EVERY))
 
 

@@ -51,6 +51,12 @@ def test_too_few_or_too_many_views_are_refused(views):
         llff_split(20, views)
 
 
+def test_more_views_than_are_not_held_out_are_refused_with_the_way_to_all():
+    """The owner of three photographs was told to choose from two, although `--test none` trains on all."""
+    with pytest.raises(ValueError, match=r"the 2 of 3 photographs that are not held out.*1 to 2, or .*--test none"):
+        llff_split(3, 5)
+
+
 def test_blender_split():
     assert blender_split(100, 200, 8) == (BLENDER, list(range(0, 200, 8)))
     assert blender_split(8, 25, 8) == (list(range(8)), list(range(25)))
