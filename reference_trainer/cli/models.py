@@ -59,7 +59,7 @@ class Evaluate:
         """Refuse what cannot work, before anything heavy is imported."""
         place = place_of(self.run, self.scene, self.orbit)
         if isinstance(place, OrbitOptions) and self.lpips is not None:
-            raise ValueError("without photographs there is no --lpips: give --path.")
+            raise ValueError("without photographs there is no --lpips: give --scene.")
         check_model(self.run, place)
         check_out(self.out, self.run, place)
 

@@ -95,10 +95,10 @@ def place_of(source: Path, scene: PlyScene, orbit: OrbitOptions) -> SceneOptions
         return None
     if scene.path == "orbit":
         if replace(scene, background="auto") != PlyScene():
-            raise ValueError("without photographs no option of a scene but --background applies: give --path.")
+            raise ValueError("without photographs no option of a scene but --background applies: give --scene.")
         return orbit
     if orbit != OrbitOptions():
-        raise ValueError(f"the options of an orbit do not apply to the scene {scene.path}: leave them, or --path, out.")
+        raise ValueError(f"the options of an orbit do not apply to the scene {scene.path}: leave out them, or --scene.")
     return scene
 
 

@@ -207,7 +207,7 @@ def _on_orbit(model: TrainedModel, orbit: OrbitOptions, about: dict[str, object]
     if sphere.surroundings and orbit.arc > 180:
         _log.info(
             "This is a place and not an object: an orbit shows it from sides that no photograph may have seen. Give "
-            "its photographs (--path), or the side that was photographed (--arc 40)."
+            "its photographs (--scene), or the side that was photographed (--arc 40)."
         )
     enlarged = max(1.0, SMALLEST_RADIUS / sphere.radius)
     model = replace(model, gaussians=scaled(model.gaussians, enlarged))

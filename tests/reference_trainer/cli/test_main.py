@@ -227,7 +227,7 @@ def test_an_unknown_scene(capsys, tmp_path):
             ["evaluate", "a.ply", "--scene", "synthetic", "--cameras", "3"],
             "the options of an orbit do not apply",
         ),
-        (["evaluate", "a.ply", "--lpips", "installed"], "give --path"),
+        (["evaluate", "a.ply", "--lpips", "installed"], "give --scene"),
         (["evaluate", "run", "--scene", "synthetic"], "run is no PLY, and a run is looked at on its own scene"),
         (["view", "run", "--background", "white"], "run is no PLY, and a run is looked at on its own scene"),
         (["clean", "a.ply", "--views", "3"], "without photographs no option of a scene but --background"),
