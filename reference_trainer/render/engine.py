@@ -8,7 +8,6 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 from unittest.mock import patch
 
 import torch
@@ -128,25 +127,16 @@ class _CompiledEngine:
     or in one order where PyTorch is asked for deterministic ones.
     """
 
-    _project: Any
-    bin: Any
-    composite: Any
-    composite_masks: Any
-    absolute_gradients: Any
-    moments: Any
-    shares: Any
-
     def __init__(self, name: str) -> None:
         self.name = name
-        for module, functions in {
-            "projection": ("_project",),
-            "binning": ("bin",),
-            "compositing": ("composite", "composite_masks", "absolute_gradients"),
-            "moments": ("moments", "shares"),
-        }.items():
-            found = importlib.import_module(f"reference_trainer.render.{name}.{module}")
-            for function in functions:
-                setattr(self, function, getattr(found, {"bin": "bin_gaussians"}.get(function, function.lstrip("_"))))
+        projection, binning, compositing, moments = (
+            importlib.import_module(f"reference_trainer.render.{name}.{module}")
+            for module in ("projection", "binning", "compositing", "moments")
+        )
+        self._project, self.bin = projection.project, binning.bin_gaussians
+        self.composite, self.composite_masks = compositing.composite, compositing.composite_masks
+        self.absolute_gradients = compositing.absolute_gradients
+        self.moments, self.shares = moments.moments, moments.shares
 
     def project(self, inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
         """Project the Gaussians; refuse a pose that waits for a gradient, which none of the kernels computes."""
