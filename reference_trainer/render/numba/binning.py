@@ -162,7 +162,7 @@ def bin_gaussians(projected: Projected, width: int, height: int, check: Callable
     """List the Gaussians of every tile, see `Engine.bin`."""
     check(projected.numbers.tolist())
     m, f, c, z = (x.detach().numpy() for x in projected.projection)
-    o = projected.opacities.detach().numpy()
+    o = projected.opacities.detach().contiguous().numpy()  # if all are in view, those that were given
     count, tiles, order = m.shape[0], -(-width // TILE) * -(-height // TILE), _nearest_first(z)
     ellipses, of_rows, entries = np.empty((count, 8), f4), np.empty(count, np.int32), np.empty(count, np.int32)
     in_threads(_measure, count, m, f, c, o, height, ellipses, of_rows, least=8192)

@@ -127,3 +127,23 @@ def test_triton_renders_float32_on_a_card_and_if_interpreted_on_a_cpu(monkeypatc
     assert engine_for(torch.device("cpu")).name == "triton"
     assert describe_engine("cpu").startswith("triton ")
     assert describe_engine("cpu").endswith("interpreted)")
+
+
+def test_no_loop_is_compiled_again_for_tensors_that_lie_in_larger_ones():
+    from reference_trainer.compiled.compiling import KERNELS
+
+    use_engine("numba")
+    scene = random_scene(40, 30, 20, seed=1).to(torch.float32)
+    depths = scene.means @ scene.camera.world_to_camera[2, :3] + scene.camera.world_to_camera[2, 3]
+    seen = [x[depths > 0.3].contiguous() for x in scene.tensors()]
+    apart = [torch.stack([x, x], dim=-1)[..., 0] for x in seen]
+    assert not any(x.is_contiguous() for x in apart)
+    images, compiled = [], []
+    for *tensors, colors in (seen, apart):
+        leaves = [x.detach().requires_grad_() for x in tensors]
+        image = render(*leaves, scene.camera, colors=colors).image
+        image.sum().backward()
+        images.append(image)
+        compiled.append([len(kernel.signatures) for kernel in KERNELS])
+    assert torch.equal(*images)
+    assert compiled[0] == compiled[1]
