@@ -26,6 +26,7 @@ from reference_trainer.runs.folder import (
     PLAN,
     PLY,
     RESULTS,
+    SCENE,
     VIEWS,
     check_output,
     report_file,
@@ -43,7 +44,6 @@ RECIPE = "sparse"
 PRESETS = {"quick": (1_000, 100_000), "default": (2_000, 200_000), "quality": (5_000, 500_000)}
 """Training steps, and pixels to which photographs are reduced."""
 MARK = "photographs.json"
-SCENE = "scene"
 Step = Literal["photographs", "poses", "train", "evaluate", "report"]
 _WRITTEN: dict[Step, tuple[str, ...]] = {
     "photographs": (MARK, SCENE),

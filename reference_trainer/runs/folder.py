@@ -21,9 +21,9 @@ from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig, saved_config
 
 __all__ = [
-    "BAKED_PLY", "CHECKPOINT", "COMPARISON", "CONFIG", "LOCK", "PLAN", "PLY", "RESULTS", "VIEWS", "FolderInUseError",
-    "check_output", "check_run", "check_trusted", "folder_name", "modules_named", "read_results", "read_run_settings",
-    "report_file", "run_lock", "run_settings", "runs_of", "settings_of_run",
+    "BAKED_PLY", "CHECKPOINT", "COMPARISON", "CONFIG", "LOCK", "PLAN", "PLY", "RESULTS", "SCENE", "VIEWS",
+    "FolderInUseError", "check_output", "check_run", "check_trusted", "folder_name", "modules_named", "read_results",
+    "read_run_settings", "report_file", "run_lock", "run_settings", "runs_of", "settings_of_run",
 ]  # fmt: skip
 
 CONFIG = "config.json"
@@ -34,6 +34,7 @@ BAKED_PLY = "point_cloud_for_viewers.ply"
 VIEWS = "views"  # here and in the folder of an evaluation
 RESULTS = "results.json"
 COMPARISON = "comparison.json"  # of several runs
+SCENE = "scene"  # where `ca-reg run` puts photographs that have no cameras, in a folder of their name
 
 _OWN_PAGE = b'<meta name="generator" content="ca-reg report">'  # near the beginning of report/page.html
 _CODE = ("regularizer", "loss", "density", "renderer", "format")  # settings that may name a module:Class
@@ -57,7 +58,8 @@ def run_settings(options: SceneOptions, config: TrainConfig) -> dict[str, Any]:
 def read_run_settings(path: str | Path) -> tuple[SceneOptions, TrainConfig]:
     """Return the scene and the training of a run from its ``config.json``.
 
-    Settings that the file lacks, because an older version wrote it, take their defaults.
+    Settings that the file lacks, because an older version wrote it, take their defaults. A scene that `ca-reg run` has
+    put into the folder of the run is found there, wherever that has been moved.
 
     Raises:
         ValueError: if the file is not a run's ``config.json``, or holds an unknown or invalid setting.
@@ -75,6 +77,9 @@ def read_run_settings(path: str | Path) -> tuple[SceneOptions, TrainConfig]:
     if not isinstance(content, dict) or not {"scene", "config"} <= content.keys():
         raise ValueError(f"{path} is not the config.json of a run: it must hold the objects 'scene' and 'config'.")
     scene = settings_from(SceneOptions, content["scene"], f"{path}, scene")
+    place = Path(scene.path)
+    if place.parent.name == SCENE and (own := Path(path).parent / SCENE / place.name).is_dir():
+        scene = dataclasses.replace(scene, path=str(own))
     return scene, saved_config(content["config"], f"{path}, config")
 
 

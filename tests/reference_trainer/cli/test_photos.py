@@ -18,6 +18,7 @@ from reference_trainer.cli import main, photos
 from reference_trainer.evaluation.pictures import save_png
 from reference_trainer.report import page as page_module
 from reference_trainer.runs import warmup
+from reference_trainer.runs.run import load_run
 from reference_trainer.scenes import photographs, poses, synthetic_scene
 from reference_trainer.scenes.images import read_image
 
@@ -141,6 +142,23 @@ def test_an_interrupted_run_goes_on(garden, tmp_path, monkeypatch, capsys):
     garden.rename(tmp_path / "yard")
     main(["run", "yard", "--out", "out", "--no-open"])
     assert seen(out) == finished
+
+
+@pytest.mark.slow
+def test_a_run_that_is_moved_takes_its_photographs_along(garden, tmp_path, capsys):
+    main(["run", "garden", "--out", "out", "--no-open"])
+    moved = (tmp_path / "out").rename(tmp_path / "on another disk")
+    main(["render", "on another disk", "--what", "train"])
+    assert len([*(moved / "render_train").glob("*.png")]) == 3
+    (moved / "report.html").unlink()
+    main(["run", "garden", "--out", "on another disk", "--no-open"])
+    assert (moved / "report.html").is_file()
+
+    # A copy does not need the original, which may have changed.
+    shutil.copytree(moved, tmp_path / "copy")
+    shutil.rmtree(moved / "scene")
+    assert load_run(tmp_path / "copy").scene.train[0].name.startswith("train_0")
+    assert "which is not there anymore" in refused(["render", "on another disk", "--what", "train"], capsys)
 
 
 @pytest.mark.slow
