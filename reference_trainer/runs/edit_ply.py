@@ -170,7 +170,7 @@ def clean_ply(
     save_ply(scaled(last.gaussians, 1 / loaded.enlarged), out, regularizer=last.regularizer, step=last.step)
     _log.info(_table(found))
     before, *_, after = (evaluation.mean("train", "psnr") for evaluation in found.values())
-    if after < before:
+    if round(after, 2) < round(before, 2):  # as they are shown
         _log.warning("The photographs of the training are fitted worse than before: %.2f dB, for %.2f.", after, before)
     _log.info("%s: %d of %d Gaussians", out, len(last.gaussians), len(stays))
     return found

@@ -6,6 +6,7 @@ import torch
 from reference_trainer.evaluation.shares import blend_weights, guard, mean_shares, share_per_weight
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
+from reference_trainer.runs import edit_ply
 from reference_trainer.runs.edit_ply import clean_ply
 from reference_trainer.runs.folder import BAKED_PLY, PLY
 from reference_trainer.runs.measure import load_run_model
@@ -117,3 +118,18 @@ def test_a_worse_fit_is_said(run, options, tmp_path, said):
     before, after = (evaluation.mean("train", "psnr") for evaluation in found.values())
     assert after < before - 1
     assert any(f"fitted worse than before: {after:.2f} dB, for {before:.2f}" in text for text in said)
+
+
+def test_a_fit_that_looks_the_same_is_not_said_to_be_worse(run, options, tmp_path, said, monkeypatch):
+    """The guard took 3 of 14,214: "fitted worse than before: 12.56 dB, for 12.56"."""
+    measured = iter([12.561, 12.559])
+
+    def evaluate(*arguments):
+        value, found = next(measured), original(*arguments)
+        return dataclasses.replace(found, views=[dataclasses.replace(view, psnr=value) for view in found.views])
+
+    original = edit_ply.evaluate
+    monkeypatch.setattr(edit_ply, "evaluate", evaluate)
+    clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.1, refine=0, anyway=True)
+    assert sum("12.56" in text for text in said) == 1  # the table
+    assert not any("fitted worse" in text for text in said)
