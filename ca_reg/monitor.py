@@ -44,8 +44,8 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
     Each measurement becomes one line of ``ca.jsonl``, on disk when the call returns: ``step``, ``gaussians``, the
     settings of the score, and for each group of views ``ca/<group>``, ``ca_std_error/<group>``, ``ca_reason/<group>``,
     ``ca_empty_views/<group>`` and ``psnr/<group>``; null is a missing value. Where tensorboard is installed, and in
-    the ``sinks``, ``gaussians``, ``ca/<group>`` and ``psnr/<group>`` become scalars as well. :func:`plot_dynamics`
-    plots the file.
+    the ``sinks``, ``gaussians``, ``ca/<group>`` and ``psnr/<group>`` become scalars as well; an exact score at drop
+    rate 1/2 stands there as ``exact CA (1e-3)/<group>``, times a thousand. :func:`plot_dynamics` plots the file.
 
     As long as the number of Gaussians stays the same, every measurement of a view uses the same masks: sampling noise
     does not disturb the comparison of steps.
@@ -98,6 +98,8 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         sinks: Sequence[Any] = (),
         resume_step: int | None = None,
     ) -> None:
+        if not isinstance(score, CAScore):
+            raise TypeError(f"score must be a CAScore, such as CAScore(render_fn), got {type(score).__name__}.")
         check_count(every, "every", minimum=1)
         for name, step in (("last_step", last_step), ("resume_step", resume_step)):
             if step is not None:

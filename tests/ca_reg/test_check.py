@@ -43,6 +43,7 @@ CASES = {
     ),
     "shares of a sampled score": (ValueError, "exact", lambda: ca_reg.attribute(score, print, half, None)),
     "a penalty of -1": (ValueError, "weight", lambda: CAPenalty(print, Multiplier.dropout(0.2), weight=-1.0)),
+    "a monitor of a renderer": (TypeError, "score", lambda: CAMonitor(print, FOLDER, views={"test": [1.0]})),
     "a monitor of no views": (ValueError, "views", lambda: CAMonitor(score, FOLDER, views={}, every=1)),
     "a monitor of a list": (TypeError, "views", lambda: CAMonitor(score, FOLDER, views=[1.0], every=1)),
     "a chain of numbers": (TypeError, "module", lambda: Chain(0.2)),
