@@ -35,7 +35,18 @@ from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["binocular", "candidate", "choosing", "differences", "failures", "judging", "main", "measured", "second"]
+__all__ = [
+    "binocular",
+    "candidate",
+    "choosing",
+    "differences",
+    "failures",
+    "judging",
+    "main",
+    "measured",
+    "second",
+    "tables",
+]
 
 Row = dict[str, Any]
 """``scene``, ``candidate`` and ``seed``, ``held-out`` PSNR if there are such views, ``test`` figures, ``gaussians``."""
@@ -56,7 +67,9 @@ _SECOND: dict[str, tuple[str, Any]] = {
 """What a candidate of the second choice changes in the chosen setting: a field and its value, of a loss the term."""
 _FIGURES = "psnr", "ssim", "lpips", "ca_exact_half"
 CHOSEN = "drawn"
-"""The candidate that is judged."""
+"""What the first choice chose, and the second started from."""
+RECOMMENDED = "from 1,000"
+"""What the second choice chose: ``--recipe sparse`` of today."""
 SEEDS = 5
 """So many, from 0 on, judge the chosen one."""
 FEWEST = 3
@@ -102,9 +115,13 @@ def main(
                 write_json(out, rows)
     else:
         rows = json.loads(paths[0].read_text("utf-8"))
-    print(
-        choosing(rows), second(rows), second(rows, (0, 1)), judging(rows), binocular(rows), failures(rows), sep="\n\n"
-    )
+    print(*tables(rows), sep="\n\n")
+
+
+def tables(rows: Sequence[Row]) -> list[str]:
+    """Return all tables of the page."""
+    judged = [judging(rows), judging(rows, chosen=RECOMMENDED)]
+    return [choosing(rows), second(rows), second(rows, (0, 1)), *judged, binocular(rows), failures(rows)]
 
 
 def candidate(config: TrainConfig) -> str:
@@ -233,30 +250,31 @@ def differences(rows: Sequence[Row], references: Path = REFERENCES, *, chosen: s
 
 
 def binocular(rows: Sequence[Row], references: Path = REFERENCES) -> str:
-    """Return the table of the chosen one against Binocular3DGS with dropout, over the seeds that both have."""
+    """Return the table of the recommended one against Binocular3DGS with dropout, over the seeds that both have."""
     lines, ahead = [], list[float]()
     for scene in SCENES:
-        own, other = _of(rows, scene, CHOSEN), _references(rows, references, scene)[BINOCULAR]
+        own, other = _of(rows, scene, RECOMMENDED), _references(rows, references, scene)[BINOCULAR]
         shared = sorted(own.keys() & other.keys())
         if not shared:
             continue
         pairs = [value(own[seed], "test psnr") - value(other[seed], "test psnr") for seed in shared]
         ahead.append(fmean(pairs))
         line = {"scene": scene, "seeds": str(len(shared))}
-        for name, of in ((BINOCULAR, other), (CHOSEN, own)):
+        for name, of in ((BINOCULAR, other), (RECOMMENDED, own)):
             line[f"{name} PSNR"] = format_mean_std((value(of[seed], "test psnr") for seed in shared), decimals=2)
         lines.append(line | {"ahead, by seed": ", ".join(f"{x:+.2f}" for x in pairs)})
     if not lines:
         return f"Nothing of {BINOCULAR!r} was measured."
-    won = f"{CHOSEN} ahead on {sum(x > 0 for x in ahead)} of {len(ahead)} scenes, by {fmean(ahead):+.2f} dB in the mean"
-    return "\n".join([markdown_table(lines, list(lines[0])), "", f"- {won}"])
+    won = f"ahead on {sum(x > 0 for x in ahead)} of {len(ahead)} scenes, by {fmean(ahead):+.2f} dB in the mean"
+    return "\n".join([markdown_table(lines, list(lines[0])), "", f"- {RECOMMENDED}: {won}"])
 
 
 def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     """Return the table of the seeds: median, spread and the worst by scene and setting, and how often one fails."""
-    lines, counts, below = [], dict[str, list[bool]](), list[bool]()
+    lines, counts, below = [], dict[str, list[bool]](), dict[str, list[bool]]()
     for scene in FAILING:
-        every = {CHOSEN: _of(rows, scene, CHOSEN)} | _references(rows, references, scene)
+        every = {name: _of(rows, scene, name) for name in (RECOMMENDED, CHOSEN)}
+        every |= _references(rows, references, scene)
         figures = {
             name: {seed: value(row, "test psnr") for seed, row in of.items()}
             for name, of in every.items()
@@ -271,13 +289,15 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
                 "standard deviation": f"{mean_std(of.values())[1]:.2f}", "worst": f"{worst:.2f}",
                 "to the median": f"{worst - middle:+.2f}", "failures": str(sum(failed)),
             })  # fmt: skip
-        plain, own = (figures.get(name, {}) for name in ("plain", CHOSEN))
-        below += [own[seed] < plain[seed] for seed in own.keys() & plain.keys()]
+        plain = figures.get("plain", {})
+        for name in (RECOMMENDED, CHOSEN):
+            own = figures.get(name, {})
+            below.setdefault(name, []).extend(own[seed] < plain[seed] for seed in own.keys() & plain.keys())
     if not lines:
         return f"No setting has {FEWEST} seeds."
     shares = [f"{name}: {_share(of)} fail" for name, of in counts.items()]
-    together = [*shares, f"{CHOSEN} below plain, same seed: {_share(below)}"]
-    return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {line}" for line in together)])
+    shares += [f"{name} below plain, same seed: {_share(of)}" for name, of in below.items() if of]
+    return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {line}" for line in shares)])
 
 
 def _is_second(candidate: str) -> bool:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from benchmarks import setting
+from reference_trainer.training.recipes import with_recipe
 
 
 def row(scene, candidate, seed, psnr, held_out=None):
@@ -43,14 +44,14 @@ def test_a_pair_is_of_one_scene_and_seed(tmp_path):
 
 def test_binocular_is_met_by_seeds_that_both_have(tmp_path):
     other = "Binocular3DGS, dropout"
-    rows = [row("fern", "drawn", seed, psnr) for seed, psnr in enumerate((25.0, 25.5, 26.0))]
-    rows += [row("fern", other, 0, 24.0), row("fern", other, 1, 25.0), row("cape", "drawn", 0, 21.0)]
-    rows += [row("sceaux", "drawn", 2, 20.0), row("sceaux", other, 2, 20.25)]
+    rows = [row("fern", "from 1,000", seed, psnr) for seed, psnr in enumerate((25.0, 25.5, 26.0))]
+    rows += [row("fern", other, 0, 24.0), row("fern", other, 1, 25.0), row("cape", "from 1,000", 0, 21.0)]
+    rows += [row("sceaux", "from 1,000", 2, 20.0), row("sceaux", other, 2, 20.25)]
     text = setting.binocular(rows, tmp_path)
     assert "+1.00, +0.50" in text
     assert "-0.25" in text
     assert "cape" not in text
-    assert "drawn ahead on 1 of 2 scenes, by +0.25 dB in the mean" in text
+    assert "from 1,000: ahead on 1 of 2 scenes, by +0.25 dB in the mean" in text
 
 
 def test_a_failure_is_a_decibel_below_the_median_of_its_own_seeds(tmp_path):
@@ -72,5 +73,17 @@ def test_the_page_has_the_tables_of_its_rows():
     page = Path(setting.__file__).with_suffix(".md").read_text("utf-8")
     rows = json.loads((setting.REFERENCES.parent / "setting.json").read_text("utf-8"))
     lines = page.splitlines()
-    for table in (setting.choosing(rows), setting.judging(rows), setting.binocular(rows), setting.failures(rows)):
+    for table in setting.tables(rows):
         assert [line for line in table.splitlines() if line and line not in lines] == []
+
+
+def test_the_recipe_is_what_was_chosen():
+    assert setting.candidate(with_recipe("sparse", iterations=3_000)) == setting.RECOMMENDED
+
+
+def test_a_candidate_of_the_second_choice_gains_over_the_mean_of_the_seeds():
+    rows = [row("fern", "drawn", seed, 25.0, held_out) for seed, held_out in enumerate((20.0, 21.0, 22.0))]
+    rows += [row("fern", "flat", 0, 25.0, 21.5), row("cape", "drawn", 0, 20.0, 14.0), row("cape", "flat", 0, 1.0, 13.0)]
+    (line,) = [x for x in setting.second(rows).splitlines() if x.startswith("| flat")]
+    assert [x.strip() for x in line.split("|")[2:-1]] == ["+0.50", "-1.00", "-0.25", "2"]
+    assert "flat" not in setting.second(rows, (0, 1))  # no seed 1
