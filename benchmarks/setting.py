@@ -67,15 +67,17 @@ _SECOND: dict[str, tuple[str, Any]] = {
 """What a candidate of the second choice changes in the chosen setting: a field and its value, of a loss the term."""
 _FIGURES = "psnr", "ssim", "lpips", "ca_exact_half"
 CHOSEN = "drawn"
-"""What the first choice chose, and the second started from."""
-RECOMMENDED = "from 1,000"
-"""What the second choice chose: ``--recipe sparse`` of today."""
+"""What the first choice chose, and the second started from: ``--recipe sparse``."""
+LATER = "from 1,000"
+"""What the second choice chose, for measured points."""
 SEEDS = 5
 """So many, from 0 on, judge the chosen one."""
 FEWEST = 3
 """From so many seeds on, a setting stands in the table of failures."""
 FAILURE = 1.0
 """A training so many dB below the median of its scene and setting has failed."""
+HELD_OUT = tuple(scene for scene in SCENES if scene not in ("lego", "dtu-scan24"))
+"""The scenes whose held-out views choose."""
 FAILING = ("herz-jesu", "fountain", "dtu-scan65", "sceaux")
 """The scenes of the study of failures."""
 REFERENCES = Path(__file__).with_name("data") / "paper"
@@ -120,7 +122,7 @@ def main(
 
 def tables(rows: Sequence[Row]) -> list[str]:
     """Return all tables of the page."""
-    judged = [judging(rows), judging(rows, chosen=RECOMMENDED)]
+    judged = [judging(rows), judging(rows, chosen=LATER)]
     return [choosing(rows), second(rows), second(rows, (0, 1)), *judged, binocular(rows), failures(rows)]
 
 
@@ -186,9 +188,10 @@ def choosing(rows: Sequence[Row]) -> str:
 def second(rows: Sequence[Row], seeds: Sequence[int] = (0,)) -> str:
     """Return the table of the second choice: gains at held-out views over the mean of the chosen one's seeds."""
     lines = []
-    for name in (x for x in dict.fromkeys(row["candidate"] for row in rows) if _is_second(x)):
+    others = dict.fromkeys(row["candidate"] for row in rows if _is_second(row["candidate"]))
+    for name in dict.fromkeys((*_SECOND, *others)):
         line, gains = {"candidate": name}, list[float]()
-        for scene in SCENES:
+        for scene in HELD_OUT:
             own, found = (
                 {seed: row["held-out"] for seed, row in _of(rows, scene, x).items() if "held-out" in row}
                 for x in (CHOSEN, name)
@@ -199,7 +202,7 @@ def second(rows: Sequence[Row], seeds: Sequence[int] = (0,)) -> str:
                 line[scene] = f"{gains[-1]:+.2f}"
         if gains:
             lines.append(line | {"mean": f"{fmean(gains):+.2f}", "scenes": str(len(gains))})
-    columns = ["candidate", *(s for s in SCENES if any(s in line for line in lines)), "mean", "scenes"]
+    columns = ["candidate", *(s for s in HELD_OUT if any(s in line for line in lines)), "mean", "scenes"]
     return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 
 
@@ -250,30 +253,34 @@ def differences(rows: Sequence[Row], references: Path = REFERENCES, *, chosen: s
 
 
 def binocular(rows: Sequence[Row], references: Path = REFERENCES) -> str:
-    """Return the table of the recommended one against Binocular3DGS with dropout, over the seeds that both have."""
-    lines, ahead = [], list[float]()
+    """Return the table of both chosen ones against Binocular3DGS with dropout, over the seeds that all have."""
+    lines, ahead = [], dict[str, list[float]]()
     for scene in SCENES:
-        own, other = _of(rows, scene, RECOMMENDED), _references(rows, references, scene)[BINOCULAR]
-        shared = sorted(own.keys() & other.keys())
-        if not shared:
+        every = {BINOCULAR: _references(rows, references, scene)[BINOCULAR]}
+        every |= {name: _of(rows, scene, name) for name in (CHOSEN, LATER)}
+        if not (shared := sorted(set.intersection(*(set(of) for of in every.values())))):
             continue
-        pairs = [value(own[seed], "test psnr") - value(other[seed], "test psnr") for seed in shared]
-        ahead.append(fmean(pairs))
+        figures = {name: [value(of[seed], "test psnr") for seed in shared] for name, of in every.items()}
         line = {"scene": scene, "seeds": str(len(shared))}
-        for name, of in ((BINOCULAR, other), (RECOMMENDED, own)):
-            line[f"{name} PSNR"] = format_mean_std((value(of[seed], "test psnr") for seed in shared), decimals=2)
-        lines.append(line | {"ahead, by seed": ", ".join(f"{x:+.2f}" for x in pairs)})
+        for name, found in figures.items():
+            line[f"{name} PSNR"] = format_mean_std(found, decimals=2)
+        lines.append(line)
+        for name in (CHOSEN, LATER):
+            ahead.setdefault(name, []).append(fmean(figures[name]) - fmean(figures[BINOCULAR]))
     if not lines:
         return f"Nothing of {BINOCULAR!r} was measured."
-    won = f"ahead on {sum(x > 0 for x in ahead)} of {len(ahead)} scenes, by {fmean(ahead):+.2f} dB in the mean"
-    return "\n".join([markdown_table(lines, list(lines[0])), "", f"- {RECOMMENDED}: {won}"])
+    won = [
+        f"{name}: ahead on {sum(x > 0 for x in of)} of {len(of)} scenes, by {fmean(of):+.2f} dB in the mean"
+        for name, of in ahead.items()
+    ]
+    return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {line}" for line in won)])
 
 
 def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     """Return the table of the seeds: median, spread and the worst by scene and setting, and how often one fails."""
     lines, counts, below = [], dict[str, list[bool]](), dict[str, list[bool]]()
     for scene in FAILING:
-        every = {name: _of(rows, scene, name) for name in (RECOMMENDED, CHOSEN)}
+        every = {name: _of(rows, scene, name) for name in (LATER, CHOSEN)}
         every |= _references(rows, references, scene)
         figures = {
             name: {seed: value(row, "test psnr") for seed, row in of.items()}
@@ -290,7 +297,7 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
                 "to the median": f"{worst - middle:+.2f}", "failures": str(sum(failed)),
             })  # fmt: skip
         plain = figures.get("plain", {})
-        for name in (RECOMMENDED, CHOSEN):
+        for name in (LATER, CHOSEN):
             own = figures.get(name, {})
             below.setdefault(name, []).extend(own[seed] < plain[seed] for seed in own.keys() & plain.keys())
     if not lines:
