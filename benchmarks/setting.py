@@ -33,6 +33,7 @@ from reference_trainer.evaluation.tables import format_mean_std, markdown_table,
 from reference_trainer.json_files import read_json
 from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.measure import load_run_model
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 
 __all__ = [
@@ -45,6 +46,7 @@ __all__ = [
     "main",
     "measured",
     "second",
+    "starts",
     "tables",
 ]
 
@@ -78,6 +80,8 @@ FAILURE = 1.0
 """A training so many dB below the median of its scene and setting has failed."""
 HELD_OUT = tuple(scene for scene in SCENES if scene not in ("lego", "dtu-scan24"))
 """The scenes whose held-out views choose."""
+STARTS = {"random": "random points", "filled.ply": "few measured points, random added"}
+"""Values of ``--points`` whose rows stand apart, and what they are called."""
 FAILING = ("herz-jesu", "fountain", "dtu-scan65", "sceaux")
 """The scenes of the study of failures."""
 REFERENCES = Path(__file__).with_name("data") / "paper"
@@ -112,7 +116,7 @@ def main(
         known = {(row["scene"], row["candidate"], row["seed"]) for row in rows}
         for run in paths:
             options, config = read_run_settings(run / "config.json")
-            if (Path(options.path).name, candidate(config), config.seed) not in known:
+            if (_scene(options), candidate(config), config.seed) not in known:
                 rows.append(measured(run, load_lpips(lpips)))
                 write_json(out, rows)
     else:
@@ -123,7 +127,7 @@ def main(
 def tables(rows: Sequence[Row]) -> list[str]:
     """Return all tables of the page."""
     judged = [judging(rows), judging(rows, chosen=LATER)]
-    return [choosing(rows), second(rows), second(rows, (0, 1)), *judged, binocular(rows), failures(rows)]
+    return [choosing(rows), second(rows), second(rows, (0, 1)), *judged, binocular(rows), starts(rows), failures(rows)]
 
 
 def candidate(config: TrainConfig) -> str:
@@ -150,7 +154,7 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
     options, config = read_run_settings(run / "config.json")
     results = read_json(run / "results.json")
     name = Path(options.path).name
-    row: Row = {"scene": name, "candidate": candidate(config), "seed": config.seed}
+    row: Row = {"scene": _scene(options), "candidate": candidate(config), "seed": config.seed}
     if name != "lego" and row["candidate"] not in _REFERENCES:  # lego has no other photographs
         others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(name, ())]
         row["held-out"] = fmean(quality(model, view) for view in others)
@@ -276,6 +280,22 @@ def binocular(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {line}" for line in won)])
 
 
+def starts(rows: Sequence[Row]) -> str:
+    """Return the table of trainings from other points: both chosen ones, PSNR of held-out and of test views, seed 0."""
+    lines = []
+    for start in STARTS.values():
+        for scene in SCENES:
+            own, later = (_of(rows, f"{scene}, {start}", name).get(0) for name in (CHOSEN, LATER))
+            if own and later:
+                before, after = ((row["held-out"], value(row, "test psnr")) for row in (own, later))
+                lines.append({
+                    "points": start, "scene": scene, CHOSEN: "{:.2f} / {:.2f}".format(*before),
+                    LATER: "{:.2f} / {:.2f}".format(*after),
+                    "difference": f"{after[0] - before[0]:+.2f} / {after[1] - before[1]:+.2f}",
+                })  # fmt: skip
+    return markdown_table(lines, ["points", "scene", CHOSEN, LATER, "difference"])
+
+
 def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     """Return the table of the seeds: median, spread and the worst by scene and setting, and how often one fails."""
     lines, counts, below = [], dict[str, list[bool]](), dict[str, list[bool]]()
@@ -305,6 +325,12 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     shares = [f"{name}: {_share(of)} fail" for name, of in counts.items()]
     shares += [f"{name} below plain, same seed: {_share(of)}" for name, of in below.items() if of]
     return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {line}" for line in shares)])
+
+
+def _scene(options: SceneOptions) -> str:
+    """Return the name of a scene, with its points where these are others than the scene's own."""
+    start = STARTS.get(options.points)
+    return Path(options.path).name + (f", {start}" if start else "")
 
 
 def _is_second(candidate: str) -> bool:

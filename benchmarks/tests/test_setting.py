@@ -53,6 +53,15 @@ def test_binocular_is_met_by_seeds_that_all_have(tmp_path):
     assert "from 1,000: ahead on 2 of 2 scenes, by +0.75 dB in the mean" in text
 
 
+def test_other_points_stand_apart():
+    rows = [row("fern, random points", "drawn", 0, 18.5, 18.0), row("fern, random points", "from 1,000", 0, 18.0, 17.5)]
+    rows += [row("fern", "drawn", 0, 25.0, 23.0), row("cape, random points", "drawn", 0, 15.0, 13.0)]
+    assert [line for line in setting.starts(rows).splitlines() if line.startswith("| random")] == [
+        "| random points | fern | 18.00 / 18.50 | 17.50 / 18.00 | -0.50 / -0.50 |"
+    ]
+    assert "18.00" not in setting.choosing(rows)
+
+
 def test_a_failure_is_a_decibel_below_the_median_of_its_own_seeds(tmp_path):
     figures = {"plain": (20.0, 20.5, 19.4, 20.1, 20.2), "drawn": (21.0, 19.9, 21.2, 21.1, 19.0)}
     rows = [row("fountain", name, seed, psnr) for name, of in figures.items() for seed, psnr in enumerate(of)]
