@@ -1,7 +1,8 @@
 """Every behavior of the renderer, for every engine."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
+from importlib.metadata import Distribution, PackageNotFoundError
 
 import pytest
 import torch
@@ -13,6 +14,22 @@ from stand_ins.card import CARD, pretended_card
 def engine(request, monkeypatch) -> str:
     """Each engine in turn draws what it can."""
     return chosen(request.param, monkeypatch)
+
+
+@pytest.fixture
+def unnamed(monkeypatch) -> Callable[[str], None]:
+    """Let a package be importable, but not installed by its own name, as forks for AMD's cards are."""
+    found = Distribution.from_name
+
+    def unname(missing: str) -> None:
+        def from_name(name):
+            if name == missing:
+                raise PackageNotFoundError(name)
+            return found(name)
+
+        monkeypatch.setattr(Distribution, "from_name", from_name)
+
+    return unname
 
 
 def chosen(name: str, monkeypatch: pytest.MonkeyPatch) -> str:

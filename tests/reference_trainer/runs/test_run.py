@@ -14,18 +14,7 @@ from ca_reg.monitor import LOG_NAME
 from reference_trainer.evaluation.tables import evaluation_table, summary
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import run as run_module
-from reference_trainer.runs.folder import (
-    BAKED_PLY,
-    CHECKPOINT,
-    COMPARISON,
-    CONFIG,
-    PLAN,
-    PLY,
-    RESULTS,
-    read_results,
-    read_run_settings,
-    run_settings,
-)
+from reference_trainer.runs.folder import BAKED_PLY, CHECKPOINT, COMPARISON, CONFIG, PLAN, PLY, RESULTS, read_results
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.runs.run import Monitoring, load_run, model_of, run_experiment
 from reference_trainer.scenes import load_scene
@@ -498,15 +487,3 @@ def test_a_training_that_stops_at_once_leaves_the_model_that_it_began_with(optio
     with pytest.raises(TrainingStoppedError, match=r"step 2 cannot be rendered: .* The model of step 0 is kept in "):
         run_experiment(options, config, tmp_path, **EVERY)
     assert load_run(tmp_path).step == 0
-
-
-@pytest.mark.parametrize(("trained_on", "found"), [
-    ("runs/garden/scene/garden", "moved/scene/garden"),  # what `ca-reg run` put into the folder of the run
-    ("runs/garden/scene/other", "runs/garden/scene/other"),
-    ("photographs/garden", "photographs/garden"),
-])  # fmt: skip
-def test_a_scene_in_the_folder_of_the_run_is_found_where_that_is_now(trained_on, found, short, tmp_path):
-    (tmp_path / "moved/scene/garden").mkdir(parents=True)
-    settings = run_settings(SceneOptions(str(tmp_path / trained_on)), short)
-    (tmp_path / "moved" / CONFIG).write_text(json.dumps(settings))
-    assert read_run_settings(tmp_path / "moved" / CONFIG)[0].path == str(tmp_path / found)

@@ -4,7 +4,6 @@
 """
 
 import sys
-from importlib.metadata import Distribution, PackageNotFoundError
 
 import pytest
 import torch
@@ -91,16 +90,11 @@ def test_score_map_and_shares_are_those_of_listed_pixels(package, scene, packed)
 
 
 @pytest.mark.parametrize(("version", "clamp"), [("1.5.3", 0.999), ("1.6.0", 0.99)])
-def test_alphas_are_clamped_where_the_gsplat_that_is_there_does_so(package, scene, version, clamp, monkeypatch):
+def test_alphas_are_clamped_where_the_gsplat_that_is_there_does_so(
+    package, scene, version, clamp, unnamed, monkeypatch
+):
     """By whatever name it was installed: the one for AMD's cards is amd-gsplat."""
-    found = Distribution.from_name
-
-    def from_name(name):
-        if name == "gsplat":
-            raise PackageNotFoundError(name)
-        return found(name)
-
-    monkeypatch.setattr(Distribution, "from_name", from_name)
+    unnamed("gsplat")
     monkeypatch.setattr(sys.modules["gsplat"], "__version__", version)
     given = scene.opacities, None, Multiplier.dropout(0.5), None
     told, itself = (
