@@ -243,7 +243,25 @@ def judging(rows: Sequence[Row], references: Path = REFERENCES, *, chosen: str =
         f"LPIPS against dropout alone, mean over scenes: {fmean(perceptual):+.4f}",
         f"Gaussians against dropout alone, mean over scenes: {fmean(counts):.2f}",
     ]
+    if chosen != CHOSEN:
+        goals.append(_against_first(rows, chosen, list(gains)))
     return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {goal}" for goal in goals)])
+
+
+def _against_first(rows: Sequence[Row], chosen: str, scenes: Sequence[str]) -> str:
+    """Return how a setting compares with the first choice, trained with the same seeds, in the mean over scenes."""
+    found = dict[str, tuple[float, float, float]]()
+    for scene in scenes:
+        own, first = _of(rows, scene, chosen), _of(rows, scene, CHOSEN)
+        pairs = [(own[seed], first[seed]) for seed in sorted(own.keys() & first.keys())]
+        ratios = (fmean(a[name] / b[name] for a, b in pairs) for name in ("seconds", "gaussians"))
+        found[scene] = fmean(value(a, "test psnr") - value(b, "test psnr") for a, b in pairs), *ratios
+    gain, seconds, gaussians = (fmean(of) for of in zip(*found.values(), strict=True))
+    measured_points = fmean(of[0] for scene, of in found.items() if scene != "lego")
+    return (
+        f"against {CHOSEN}, same seeds, mean over scenes: PSNR {gain:+.2f} dB (without lego {measured_points:+.2f}), "
+        f"processor time {seconds:.2f}, Gaussians {gaussians:.2f}"
+    )
 
 
 def differences(rows: Sequence[Row], references: Path = REFERENCES, *, chosen: str = CHOSEN) -> dict[str, list[float]]:

@@ -40,6 +40,10 @@ def test_a_pair_is_of_one_scene_and_seed(tmp_path):
     assert "mean gain over plain: +1.10 dB over 2 pairs of 1 scenes" in text
     assert "worst pair: -0.30 dB" in text
     assert "Gaussians against dropout alone, mean over scenes: 0.50" in text
+    later = row("fern", "from 1,000", 0, 23.0) | {"seconds": 45.0, "gaussians": 80}
+    text = setting.judging([*own, later], tmp_path, chosen="from 1,000")
+    assert "against drawn, same seeds, mean over scenes: PSNR +0.50 dB" in text
+    assert "processor time 0.75, Gaussians 0.80" in text
 
 
 def test_binocular_is_met_by_seeds_that_all_have(tmp_path):
