@@ -42,7 +42,7 @@ COMMON = {"iterations": 1_500, "opacity_reset_every": 0}
 SCENES = {
     "synthetic": SceneOptions(),
     "fern": SceneOptions("fern", images="images_16", points="sparse_3views_dense/0"),
-    "lego": SceneOptions("lego", downscale=2.0),
+    "lego": SceneOptions("lego", downscale=2.0, points="random"),
     "herz-jesu": SceneOptions("herz-jesu", images="images_2", split="split_near"),
     "fountain": SceneOptions("fountain", images="images_2", split="split_near"),
     "dtu-scan65": SceneOptions("dtu-scan65", points="sparse_3views_dense/0"),
@@ -112,7 +112,7 @@ def held_out(options: SceneOptions, seed: int) -> Scene:
     if options.path == "synthetic":
         return replace(scene, test=synthetic_scene(test_views=5, points=1).test[:-1])
     used = {view.name for view in (*scene.train, *scene.test)}
-    everything = load_scene(replace(options, split="auto", test="none"), seed=seed).train
+    everything = load_scene(replace(options, split="auto", test="none"), trains=False).train
     if others := tuple(view for view in everything if view.name not in used):
         return replace(scene, test=others)
     half = len(scene.train) // 2

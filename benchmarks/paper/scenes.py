@@ -61,7 +61,7 @@ SCENES = {
         "LLFF, 252x189, 3 and 3 views, 15,000 stereo points of the training views",
     ),
     "lego": PaperScene(
-        SceneOptions("lego", downscale=1.5),
+        SceneOptions("lego", downscale=1.5, points="random"),
         "NeRF-synthetic, 267x267 over white, 8 and 25 views, 10,000 random points",
     ),
     "dtu-scan65": PaperScene(

@@ -54,9 +54,10 @@ _WRITTEN: dict[Step, tuple[str, ...]] = {
 }
 """What each step writes. `--from` deletes that of a step and of those after it."""
 
-_TRAINING, _SHOWN, _REFERENCE = 1.9, 30.0, 2.9e-7
-"""Of `_forecast`: a training step, and measuring and showing a view, in timed steps; seconds of such a step per pixel
-on the machine on which the seconds of the poses were measured."""
+_TRAINING, _SHOWN, _MATCHED, _REFERENCE = 1.9, 30.0, 115.0, 2.9e-7
+"""Of `_forecast`: a training step, measuring and showing a view, and a photograph of the dense start if it is matched
+at the size of the training, all in timed steps; seconds of such a step per pixel on the machine on which the seconds of
+the poses were measured."""
 
 
 @dataclass(frozen=True)
@@ -205,6 +206,7 @@ class Run:
         """
         from reference_trainer.runs.warmup import step_seconds
         from reference_trainer.scenes.colmap import colmap_folders
+        from reference_trainer.scenes.dense import MOST, matched_size
         from reference_trainer.training.checkpoint import load_checkpoint
 
         if (self.folder / RESULTS).exists():
@@ -213,14 +215,21 @@ class Run:
         factor, done = options.downscale or 1.0, 0
         if (self.folder / CHECKPOINT).exists():
             done = load_checkpoint(self.folder / CHECKPOINT)["step"]
-        step = step_seconds(round(width / factor), round(height / factor), self.device)
-        times = {"training": _TRAINING * (config.iterations - done), "scores and page": _SHOWN * 3 * min(count, 8)}
+        size = round(width / factor), round(height / factor)
+        pixels, step = math.prod(size), step_seconds(*size, self.device)
+        core = step if self.device == "cpu" else _REFERENCE * pixels  # cameras and points are found by the processor
+        times = {
+            "training": step * _TRAINING * (config.iterations - done),
+            "scores and page": step * _SHOWN * 3 * min(count, 8),
+        }
+        if not done and (self.points == "dense" or (self.points == "auto" and count <= MOST)):
+            times = {"points": core * _MATCHED * count * math.prod(matched_size(*size)) / pixels, **times}
         if scene != self.photos and not colmap_folders(scene):
             megapixels = min(width * height, 1_920_000) / 1e6  # COLMAP looks at no more
             work = count * megapixels * (6.0 if count < 8 else 2.0) + 0.025 * count * (count - 1) / 2
-            times = {"poses": work / (_REFERENCE * width * height / factor**2), **times}
-        parts = ", ".join(f"{name} {_duration(step * number)}" for name, number in times.items())
-        return f"This will take about {_duration(step * sum(times.values()))} on this machine as it is now: {parts}."
+            times = {"poses": core / (_REFERENCE * pixels) * work, **times}
+        parts = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in times.items())
+        return f"This will take about {_duration(sum(times.values()))} on this machine as it is now: {parts}."
 
     def _poses(self, scene: Path) -> None:
         """Find the cameras of photographs that have none."""

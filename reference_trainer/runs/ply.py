@@ -144,7 +144,7 @@ def load_for_views(
     trust: Collection[str] = (),
 ) -> ModelWithViews:
     """Load the model of a PLY and the views of a scene, or cameras on an orbit; arguments and errors of `score_ply`."""
-    scene = load_scene(where) if isinstance(where, SceneOptions) else None
+    scene = load_scene(where, trains=False) if isinstance(where, SceneOptions) else None
     if scene is None and background not in ("auto", *BACKGROUNDS):
         raise ValueError(f"background must be one of {', '.join(BACKGROUNDS)}, got {background!r}.")
     color = torch.tensor(BACKGROUNDS.get(background, BACKGROUNDS["black"])) if scene is None else scene.background

@@ -7,6 +7,7 @@ import logging
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,13 +21,14 @@ from reference_trainer.files import replacing
 from reference_trainer.scenes.images import resize_image
 from reference_trainer.scenes.scene import PointCloud, View
 
-__all__ = ["SOURCE", "dense_points", "dense_start", "source_views"]
+__all__ = ["MOST", "SOURCE", "dense_points", "dense_start", "matched_size", "source_views"]
 
 SOURCE = "dense stereo"
 """What such a cloud names as its `source`."""
 
 COUNT = 15_000
 LEAST = 1_000
+MOST = 10  # photographs to measure on unasked: each takes five seconds of a core
 PIXELS = 200_000  # larger photographs are made smaller: more pixels take longer and add no points
 ENLARGED = 1.4  # and smaller ones larger: the windows, of a fixed number of pixels, then cover finer detail
 SPACING, PLANES = 0.7, 192  # pixels of motion from plane to plane, and their largest number
@@ -76,6 +78,12 @@ def dense_points(views: Sequence[View], guide: PointCloud | None = None, *, coun
             from different places, or fewer than 1,000 points are found.
         ImportError: if numba is missing.
     """
+    _check(views)
+    return _enough(_measure(views, guide, count), views, count)
+
+
+def _check(views: Sequence[View]) -> None:
+    """Refuse what cannot be measured on, before the work."""
     try:
         import reference_trainer.compiled.stereo as _  # noqa: F401
     except ImportError as error:
@@ -90,6 +98,21 @@ def dense_points(views: Sequence[View], guide: PointCloud | None = None, *, coun
                 raise ValueError(
                     f"a dense start needs different photographs: {other.name} and {view.name} are the same."
                 )
+
+
+def _enough(cloud: PointCloud, views: Sequence[View], count: int) -> PointCloud:
+    """Return the cloud, if its points are enough to start from."""
+    if len(cloud.positions) < min(LEAST, count // 2):
+        raise ValueError(
+            f"a dense start found only {len(cloud.positions)} points on which the {len(views)} training photographs "
+            f"agree, at least {LEAST:,} are needed: they lack texture or overlap, or the cameras are wrong. Choose "
+            "other points."
+        )
+    return cloud
+
+
+def _measure(views: Sequence[View], guide: PointCloud | None, count: int) -> PointCloud:
+    """Return at most so many points on which the photographs agree, which may be none."""
     pictures = [_picture(view, PIXELS) for view in views]
     cameras = [picture.camera for picture in pictures]
     ranges = [_guided(camera, guide) for camera in cameras]
@@ -100,25 +123,39 @@ def dense_points(views: Sequence[View], guide: PointCloud | None = None, *, coun
         ranges = [
             _guided(camera, cloud) if known is None else known for camera, known in zip(cameras, ranges, strict=True)
         ]
-    points = _agreed(pictures, _depth_maps(pictures, ranges))
-    number = 0 if points is None else len(points[0])
-    if points is None or number < min(LEAST, count):
-        raise ValueError(
-            f"a dense start found only {number} points on which the {len(views)} training photographs agree, at least "
-            f"{LEAST:,} are needed: they lack texture or overlap, or the cameras are wrong. Choose other points."
-        )
-    positions, colors, confidence = _thinned(*points, cameras, count)
+    agreed = _agreed(pictures, _depth_maps(pictures, ranges)) or (torch.empty(0, 3), torch.empty(0, 3), torch.empty(0))
+    positions, colors, confidence = _thinned(*agreed, cameras, count)
     return PointCloud(positions, colors, SOURCE, frozenset(view.name for view in views), confidence)
 
 
-def dense_start(views: Sequence[View], guide: PointCloud) -> tuple[PointCloud, str]:
-    """Return `dense_points` with a note on them; kept in the user's cache folder, for every command loads its scene.
+def dense_start(views: Sequence[View], measured: PointCloud) -> tuple[PointCloud, str]:
+    """Return `dense_points` together with the points that are measured already, and a note on them.
 
-    That is ``ca_reg`` in ``$XDG_CACHE_HOME``, else in ``~/.cache``; the file is named by a hash of all that the points
-    depend on. Errors are those of `dense_points`.
+    Those already measured tell the range of depth, and lie where the photographs have too little texture for stereo.
+    The dense ones are kept in the user's cache folder, for every command loads its scene: in ``ca_reg`` of
+    ``$XDG_CACHE_HOME``, else of ``~/.cache``, named by a hash of all that they depend on. Errors are those of
+    `dense_points`.
     """
+    _check(views)
+    dense = _enough(_kept(views, measured), views, COUNT)
+    assert dense.confidence is not None
+    number, more = len(dense.positions), len(measured.positions)
+    note = f"initial points: {number:,} measured on the {len(views)} training photographs by dense stereo"
+    if more == 0:
+        return dense, note
+    cloud = replace(
+        dense,
+        positions=torch.cat([dense.positions, measured.positions]),
+        colors=torch.cat([dense.colors, measured.colors]),
+        seen_by=None if measured.seen_by is None else measured.seen_by | (dense.seen_by or frozenset()),
+        confidence=torch.cat([dense.confidence, torch.ones(more)]),
+    )
+    return cloud, f"{note}, and {more:,} from {measured.source}"
+
+
+def _kept(views: Sequence[View], guide: PointCloud) -> PointCloud:
+    """Return what `_measure` finds, which is kept in the cache folder even if it is too little."""
     names = frozenset(view.name for view in views)
-    note = f"measured on the {len(views)} training photographs by dense stereo"
     digest = hashlib.sha256(guide.positions.numpy().tobytes())
     for code in (Path(__file__), Path(__file__).parents[1] / "compiled/stereo.py"):
         digest.update(code.read_bytes())
@@ -128,25 +165,23 @@ def dense_start(views: Sequence[View], guide: PointCloud) -> tuple[PointCloud, s
         for layer in (inner, camera.world_to_camera, view.image, view.alpha):
             digest.update(b"none" if layer is None else layer.contiguous().numpy().tobytes())
     path: Path | None = None
-    cloud: PointCloud | None = None
     try:
         path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "ca_reg", f"{digest.hexdigest()}.npz")
         with np.load(path) as kept:
             parts = [torch.from_numpy(kept[name]) for name in ("positions", "colors", "confidence")]
-        cloud = PointCloud(parts[0], parts[1], SOURCE, names, parts[2])
+        return PointCloud(parts[0], parts[1], SOURCE, names, parts[2])
     except Exception:  # nothing is kept, or a damaged file, which may raise anything
         pass
-    if cloud is None:
-        cloud = dense_points(views, guide)
-        assert cloud.confidence is not None
-        made = [part.numpy() for part in (cloud.positions, cloud.colors, cloud.confidence)]
-        try:
-            if path is not None:
-                with replacing(path) as place, place.open("wb") as file:
-                    np.savez(file, positions=made[0], colors=made[1], confidence=made[2])
-        except OSError as error:  # costs the next command half a minute
-            logging.getLogger(__name__).info("the points of the dense start are not kept: %s", error)
-    return cloud, f"initial points: {len(cloud.positions):,} {note}"
+    cloud = _measure(views, guide, COUNT)
+    assert cloud.confidence is not None
+    made = [part.numpy() for part in (cloud.positions, cloud.colors, cloud.confidence)]
+    try:
+        if path is not None:
+            with replacing(path) as place, place.open("wb") as file:
+                np.savez(file, positions=made[0], colors=made[1], confidence=made[2])
+    except OSError as error:  # costs the next command half a minute
+        logging.getLogger(__name__).info("the points of the dense start are not kept: %s", error)
+    return cloud
 
 
 def source_views(cameras: Sequence[Camera], number: int, depth: float) -> list[int]:
@@ -162,6 +197,17 @@ def source_views(cameras: Sequence[Camera], number: int, depth: float) -> list[i
         if other != number and seen >= OVERLAP and ANGLES[0] <= angles <= ANGLES[1]:
             worth.append((seen * math.exp(-(math.log(angles / USUAL) ** 2)), other))
     return [other for _, other in sorted(worth, key=lambda pair: (-pair[0], pair[1]))[:SOURCES]]
+
+
+def matched_size(width: int, height: int, most: int = PIXELS) -> tuple[int, int]:
+    """Return the size at which photographs of this size are matched; the time grows with its pixels.
+
+    Example:
+        >>> matched_size(1000, 800), matched_size(200, 100)
+        ((500, 400), (280, 140))
+    """
+    factor = min(ENLARGED, math.sqrt(most / (width * height)))
+    return max(2, round(width * factor)), max(2, round(height * factor))
 
 
 def _grid(camera: Camera, depths: Tensor) -> Tensor:
@@ -208,8 +254,7 @@ def _guided(camera: Camera, guide: PointCloud | None) -> tuple[float, float] | N
 def _picture(view: View, most: int) -> _Picture:
     """Prepare a photograph, made smaller to at most so many pixels."""
     height, width = view.image.shape[1:]
-    factor = min(ENLARGED, math.sqrt(most / (width * height)))
-    size = max(2, round(width * factor)), max(2, round(height * factor))
+    size = matched_size(width, height, most)
     colors = view.image if size == (width, height) else resize_image(view.image, *size)
     gray = colors.mean(0).numpy()
     gray = gray - gray.mean()  # numpy's: the last bits of torch's mean depend on the number of threads

@@ -14,15 +14,15 @@ from torch import Tensor
 
 from reference_trainer.json_files import read_json
 from reference_trainer.scenes.colmap import COLMAP
-from reference_trainer.scenes.dense import dense_start
+from reference_trainer.scenes.dense import MOST, dense_start
 from reference_trainer.scenes.depth import point_prior, true_priors, with_prior
 from reference_trainer.scenes.formats import Capture, find_reader, only_default, register_format
 from reference_trainer.scenes.frames import Frame, corner_displacement, load_view
 from reference_trainer.scenes.images import LARGE_PICTURE, image_size, unreadable_photographs
 from reference_trainer.scenes.numpy_formats import ARRAYS, IDR, LLFF
 from reference_trainer.scenes.options import BACKGROUNDS, SceneOptions
-from reference_trainer.scenes.points import check_no_leak, choose_points, filled, model_start
-from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.points import THIN, check_no_leak, choose_points, filled, model_start
+from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.scenes.transforms import BLENDER, TRANSFORMS
 
@@ -49,11 +49,12 @@ DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)  # PixelNeRF's; a protocol of n v
 DTU_TEST = (1, 2, 9, 10, 11, 12, 14, 15, 23, 24, 26, 27, *range(29, 36), 41, 42, 43, 45, 46, 47)
 
 
-def load_scene(options: SceneOptions, *, seed: int = 0) -> Scene:
+def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> Scene:
     """Load a scene: photographs with cameras, split into training and test views, and initial points.
 
     The scene is float32 on the CPU; views are sorted by name, those of Blender scenes in the order of the JSON file.
-    The seed is that of random points, and of the points of the built-in scene.
+    The seed is that of random points, and of the points of the built-in scene. A scene that trains nothing (``trains``
+    is False), because a model is there already, need not wait for a dense start: it may have few points, or none.
 
     Raises:
         FileNotFoundError: if a file or folder is missing.
@@ -83,17 +84,19 @@ def load_scene(options: SceneOptions, *, seed: int = 0) -> Scene:
     downscale, about_size = _downscale([*train, *test], options.downscale)
     load = partial(load_view, background=color, downscale=downscale, undistort=options.undistort)
     views = {"train": tuple(map(load, train)), "test": tuple(map(load, test))}
-    if options.points == "dense":
+    about_masks = ""
+    if not trains:
+        about_points = ""
+    elif options.points == "dense":
         cloud, about_points = dense_start(views["train"], cloud)
+    elif options.points == "auto" and start is None:
+        cloud, about_points = _enough_points(cloud, about_points, views["train"], train, generator)
     if options.depth == "points":
         views["train"] = tuple(point_prior(view, cloud) for view in views["train"])
     elif options.depth is not None:
         views["train"] = tuple(
             with_prior(view, frame, root, options) for view, frame in zip(views["train"], train, strict=True)
         )
-    about_more = about_masks = ""
-    if options.points == "auto" and start is None:
-        cloud, about_more = filled(cloud, train, generator)
     if any(frame.mask is not None for frame in [*train, *test]):
         about_masks = "masks: scores count what is white in them, training uses the whole photographs"
     about_lenses = _about_lenses([*train, *test], options)
@@ -107,8 +110,25 @@ def load_scene(options: SceneOptions, *, seed: int = 0) -> Scene:
         start=start,
         background=color,
         source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
-        notes=tuple(filter(None, (about_unread, about_size, about_lenses, about_masks, about_points, about_more))),
+        notes=tuple(filter(None, (about_unread, about_size, about_lenses, about_masks, about_points))),
     )
+
+
+def _enough_points(
+    cloud: PointCloud, about: str, views: Sequence[View], train: Sequence[Frame], generator: torch.Generator
+) -> tuple[PointCloud, str]:
+    """Add to measured points, if they are few, those of a dense start, or random ones where that cannot be."""
+    if len(cloud.positions) >= THIN:
+        return cloud, about
+    if len(views) > MOST:
+        cloud, more = filled(cloud, train, generator)
+        return cloud, "; ".join(filter(None, (about, more)))
+    try:
+        dense, more = dense_start(views, cloud)
+    except (ImportError, ValueError) as error:
+        cloud, more = filled(cloud, train, generator)
+        return cloud, "; ".join(filter(None, (about, more, str(error))))
+    return dense, more if len(cloud.positions) else "; ".join(filter(None, (more, about)))
 
 
 def _built_in(options: SceneOptions, seed: int) -> Scene:

@@ -48,8 +48,8 @@ class SceneOptions:
     points: str = "auto"
     """Initial points: a COLMAP folder such as sparse_3views/0, a .ply file (points or 3DGS) within the scene, "random"
     or "random:COUNT", or "dense" for points measured on the training photographs by stereo, in half a minute; by
-    default the largest cloud made from training views alone, with random ones besides if it has fewer than 1,000,
-    else random ones."""
+    default the largest cloud made from training views alone. If it has fewer than 1,000 points, or there is none, up to
+    ten training photographs get a dense start besides; random points where that finds nothing."""
     init: str | None = None
     """A 3DGS .ply, anywhere: training starts from all parameters of its Gaussians, in place of points."""
     depth: str | None = None

@@ -26,7 +26,7 @@ __all__ = [
 
 RANDOM_POINTS = 10_000  # as DNGaussian for the Blender scenes
 THIN = 1_000
-"""A reconstructed cloud of fewer points is filled up with random ones, unless the user asked for it."""
+"""To a measured cloud of fewer points others are added, unless the user asked for it."""
 INSTANTSPLAT = "points3D.ply"
 OPAQUE = 13.0  # replaces an infinite logit, which cannot be trained
 
@@ -44,15 +44,14 @@ def choose_points(
 
     It is ``"auto"``, ``"random"``, ``"random:<count>"``, or a ``.ply`` file or COLMAP folder within the scene;
     ``held_out`` names the photographs that do not train; ``own`` are the points that the scene file names. For
-    ``"dense"`` these are the points of ``"auto"`` that tell a dense start (`reference_trainer.scenes.dense`) how far
-    the scene is, or none.
+    ``"auto"`` and ``"dense"`` these are the largest measured cloud that has seen training views alone, or none: what is
+    added to them, such as a dense start (`reference_trainer.scenes.dense`), needs the photographs.
 
     Raises:
         FileNotFoundError: if the file or folder is missing.
         ValueError: if the option or a file is invalid.
     """
     kind, _, count = points.partition(":")
-    passed = ""
     if points in ("auto", "dense"):
         offered = [own] if own is not None else []
         offered += [cloud for folder in colmap_folders(root) if (cloud := colmap_points(folder)) is not None]
@@ -61,19 +60,18 @@ def choose_points(
         if honest:
             best = max(reversed(honest), key=lambda cloud: len(cloud.positions))
             return best, f"initial points: {len(best.positions):,} from {best.source}"
-        if points == "dense":
-            return PointCloud(torch.empty(0, 3), torch.empty(0, 3), source="none", seen_by=frozenset()), ""
-        kind = "random"
-        if offered:
-            passed = (
-                f"; the points from {', '.join(cloud.source for cloud in offered)} have seen views that do not train "
-                "(with --test none and no --views all train; --points FOLDER --allow-test-points takes them anyway)"
-            )
+        empty = PointCloud(torch.empty(0, 3), torch.empty(0, 3), source="none", seen_by=frozenset())
+        if not offered:
+            return empty, ""
+        return empty, (
+            f"the points from {', '.join(cloud.source for cloud in offered)} have seen views that do not train (with "
+            "--test none and no --views all train; --points FOLDER --allow-test-points takes them anyway)"
+        )
     if kind == "random":
         if count and not (count.isdecimal() and int(count) > 0):
             raise ValueError(f"points must be random or random:<count>, such as random:10000, got {points!r}.")
         cloud = random_points(train, int(count or RANDOM_POINTS), generator)
-        return cloud, f"initial points: {len(cloud.positions):,} random ones{passed}"
+        return cloud, f"initial points: {len(cloud.positions):,} random ones"
     path = path_inside(root, points)
     if not is_colmap(path) and not is_ply(path):
         found = sorted(folder.relative_to(root).as_posix() for folder in colmap_folders(root))
@@ -88,13 +86,13 @@ def choose_points(
 
 
 def filled(cloud: PointCloud, train: Sequence[Frame], generator: torch.Generator) -> tuple[PointCloud, str]:
-    """Add random points to a reconstructed cloud of fewer than `THIN` points, and return it with a note.
+    """Add random points to a cloud of few measured ones, or of none, and return it with a note.
 
-    They lie in the frusta of the training cameras, between the 1st and 99th percentiles of the cloud's depths. On fern
-    from three views, training from 459 points alone ends 1 dB lower.
+    They lie in the frusta of the training cameras, between the 1st and 99th percentiles of the cloud's depths; without
+    any point where `random_points` puts them. On fern from three views, training from 459 points alone ends 1 dB lower.
     """
-    if len(cloud.positions) >= THIN or cloud.source == "random":
-        return cloud, ""
+    if len(cloud.positions) == 0:
+        return random_points(train, RANDOM_POINTS, generator), f"initial points: {RANDOM_POINTS:,} random ones"
     cameras = [frame.camera for frame in train]
     depths = torch.cat([camera.project(cloud.positions.double())[1] for camera in cameras])
     depths = depths[depths > 0]

@@ -237,12 +237,12 @@ def initial_size(scene: Scene, config: TrainConfig) -> PlanItem:
 
 
 def dense_start(scene: Scene, config: TrainConfig) -> PlanItem:
-    """Points measured by stereo. They must be asked for when the scene is loaded: the plan can only tell of them."""
+    """Points measured by stereo. It is decided when the scene is loaded: the plan can only tell of them."""
     name, count = "dense start", len(scene.train)
     if scene.start is not None:
         return PlanItem(name, "left out", "by construction: training starts from a model")
     if scene.points.source == SOURCE:
-        return PlanItem(name, "used", f"asked for: {len(scene.points.positions)} points")
+        return PlanItem(name, "used", f"{len(scene.points.positions)} points, measured on the training photographs")
     cameras, matched = [view.camera for view in scene.train], 0
     for number, camera in enumerate(cameras):
         pixels, depths = camera.project(scene.points.positions)

@@ -212,11 +212,74 @@ def written(root, views):
     (root / "transforms.json").write_text(json.dumps(numbers | {"frames": frames}))
 
 
+def plane(*at):
+    """Small photographs of the plane, taken from beside one another."""
+    size = {"width": 64, "height": 48, "focal": 60.0}
+    return [plane_view(f"{i}", looking(x, **size), 0.2) for i, x in enumerate(at)]
+
+
+def few_points(root, number):
+    """Write so many points of the plane as those of the scene file."""
+    x, y = torch.rand(2, number, generator=torch.Generator().manual_seed(1)) - 0.5
+    points = torch.stack([x, y, 5 + 0.2 * x], 1)
+    lines = [f"{' '.join(f'{c:.6f}' for c in point)} 9 9 9" for point in points.tolist()]
+    kinds = [*(f"property float {c}" for c in "xyz"), *(f"property uchar {c}" for c in ("red", "green", "blue"))]
+    head = ["ply", "format ascii 1.0", f"element vertex {number}", *kinds, "end_header"]
+    (root / "few.ply").write_text("\n".join([*head, *lines]) + "\n")
+    scene = json.loads((root / "transforms.json").read_text())
+    (root / "transforms.json").write_text(json.dumps(scene | {"ply_file_path": "few.ply"}))
+    return points
+
+
+def test_few_measured_points_and_a_dense_start_are_what_a_training_begins_with_unasked(tmp_path):
+    written(tmp_path / "scene", plane(-0.3, 0.0, 0.3))
+    few = few_points(tmp_path / "scene", 99)
+    scene = load_scene(SceneOptions(str(tmp_path / "scene")))
+    x, _, z = scene.points.positions.unbind(1)
+    assert len(x) > 1000
+    assert ((5 + 0.2 * x) / z - 1).abs().median() < 0.01
+    assert torch.allclose(scene.points.positions[-99:], few, atol=1e-5)
+    assert len(scene.points.confidence) == len(scene.points.colors) == len(x)
+    assert "dense stereo, and 99 from" in str(scene)
+    kept = load_scene(SceneOptions(str(tmp_path / "scene")), trains=False).points
+    assert len(kept.positions) == 99  # enough for what trains nothing, and at once
+
+
+def test_a_thousand_measured_points_are_enough(tmp_path, cache):
+    written(tmp_path / "scene", plane(-0.3, 0.0, 0.3))
+    few_points(tmp_path / "scene", 1000)
+    assert len(load_scene(SceneOptions(str(tmp_path / "scene"))).points.positions) == 1000
+    assert not cache.exists()
+
+
+def test_where_a_dense_start_finds_nothing_random_points_are_taken_and_it_is_not_tried_again(tmp_path, cache):
+    size = {"width": 64, "height": 48, "focal": 60.0}
+    inward = [looking(x, turn=-0.2 * x, **size) for x in (-0.3, 0.3)]
+    written(
+        tmp_path / "scene", [View(f"{i}", camera, torch.full((3, 48, 64), 0.3 * i)) for i, camera in enumerate(inward)]
+    )
+    options = SceneOptions(str(tmp_path / "scene"))
+    scene = load_scene(options)
+    assert (scene.points.source, len(scene.points.positions)) == ("random", 10_000)
+    assert "10,000 random ones; a dense start found only 0 points" in str(scene)
+    (file,) = cache.rglob("*.npz")
+    assert len(np.load(file)["positions"]) == 0  # kept, for the next command loads the scene again
+    few_points(tmp_path / "scene", 99)
+    assert len(load_scene(options).points.positions) == 99 + 10_000
+
+
+def test_of_many_photographs_a_dense_start_must_be_asked_for(tmp_path, cache):
+    written(tmp_path / "scene", plane(*np.linspace(-0.5, 0.5, 11).tolist()))
+    few_points(tmp_path / "scene", 99)
+    scene = load_scene(SceneOptions(str(tmp_path / "scene"), test="none"))
+    assert len(scene.points.positions) == 99 + 10_000
+    assert not cache.exists()
+
+
 @pytest.mark.slow
 def test_a_scene_folder_stays_as_it_is_and_the_points_are_kept_elsewhere(tmp_path, cache):
     root = tmp_path / "scene"
-    size = {"width": 64, "height": 48, "focal": 60.0}
-    written(root, [plane_view(f"{i}", looking(x, **size), 0.2) for i, x in enumerate((-0.3, 0.0, 0.3))])
+    written(root, plane(-0.3, 0.0, 0.3))
     before = sorted(root.rglob("*"))
     options = SceneOptions(str(root), points="dense")
     scene = load_scene(options)
