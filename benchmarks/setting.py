@@ -10,6 +10,7 @@ and of further seeds.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections import defaultdict
@@ -45,6 +46,7 @@ __all__ = [
     "judging",
     "main",
     "measured",
+    "rows_of",
     "second",
     "starts",
     "tables",
@@ -69,9 +71,9 @@ _SECOND: dict[str, tuple[str, Any]] = {
 """What a candidate of the second choice changes in the chosen setting: a field and its value, of a loss the term."""
 _FIGURES = "psnr", "ssim", "lpips", "ca_exact_half"
 CHOSEN = "drawn"
-"""What the first choice chose, and the second started from: ``--recipe sparse``."""
+"""What the first choice chose, and the second started from: ``--recipe sparse --densify-from 150``."""
 LATER = "from 1,000"
-"""What the second choice chose, for measured points."""
+"""What the second choice chose: ``--recipe sparse``."""
 SEEDS = 5
 """So many, from 0 on, judge the chosen one."""
 FEWEST = 3
@@ -80,8 +82,13 @@ FAILURE = 1.0
 """A training so many dB below the median of its scene and setting has failed."""
 HELD_OUT = tuple(scene for scene in SCENES if scene not in ("lego", "dtu-scan24"))
 """The scenes whose held-out views choose."""
-STARTS = {"random": "random points", "filled.ply": "few measured points, random added"}
-"""Values of ``--points`` whose rows stand apart, and what they are called."""
+FEW_AND_RANDOM = "few measured points, random added"
+STARTS = {
+    "random": "random points", "few_and_random.ply": FEW_AND_RANDOM, "dense.ply": "dense",
+    "dense_and_few.ply": "dense and few", "dense_and_random.ply": "dense, few and random", "sift.ply": "SIFT",
+    "dense_and_sift.ply": "dense and SIFT",
+}  # fmt: skip
+"""Values of ``--points`` whose rows stand apart, and what they are called: files of `benchmarks.start_scenes`."""
 FAILING = ("herz-jesu", "fountain", "dtu-scan65", "sceaux")
 """The scenes of the study of failures."""
 REFERENCES = Path(__file__).with_name("data") / "paper"
@@ -140,6 +147,8 @@ def candidate(config: TrainConfig) -> str:
     if config.analytic:
         return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
     if config.opacity_decay < 1 and config.guard:
+        begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
+        config = dataclasses.replace(config, densify_from=begins)
         values = {name: (getattr(config, field), value) for name, (field, value) in _SECOND.items()}
         changes = [name for name, (x, value) in values.items() if (value in x if isinstance(x, str) else x == value)]
         return " + ".join(changes) or CHOSEN
@@ -155,7 +164,7 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
     results = read_json(run / "results.json")
     name = Path(options.path).name
     row: Row = {"scene": _scene(options), "candidate": candidate(config), "seed": config.seed}
-    if name != "lego" and row["candidate"] not in _REFERENCES:  # lego has no other photographs
+    if name in HELD_OUT and row["candidate"] not in _REFERENCES:
         others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(name, ())]
         row["held-out"] = fmean(quality(model, view) for view in others)
     test, metric = results["mean"]["test"], results.get("perceptual_metric")
@@ -197,7 +206,7 @@ def second(rows: Sequence[Row], seeds: Sequence[int] = (0,)) -> str:
         line, gains = {"candidate": name}, list[float]()
         for scene in HELD_OUT:
             own, found = (
-                {seed: row["held-out"] for seed, row in _of(rows, scene, x).items() if "held-out" in row}
+                {seed: row["held-out"] for seed, row in rows_of(rows, scene, x).items() if "held-out" in row}
                 for x in (CHOSEN, name)
             )
             if own and all(seed in found for seed in seeds):
@@ -215,7 +224,7 @@ def judging(rows: Sequence[Row], references: Path = REFERENCES, *, chosen: str =
     lines, perceptual, counts, spreads = [], list[float](), list[float](), list[float]()
     gains = differences(rows, references, chosen=chosen)
     for scene, pairs in gains.items():
-        known = _references(rows, references, scene) | {name: _of(rows, scene, name) for name in (CHOSEN, chosen)}
+        known = _references(rows, references, scene) | {name: rows_of(rows, scene, name) for name in (CHOSEN, chosen)}
         compared = {
             name: {seed: row for seed, row in known[name].items() if seed < SEEDS}
             for name in dict.fromkeys(("plain", "dropout", CHOSEN, chosen))
@@ -252,7 +261,7 @@ def _against_first(rows: Sequence[Row], chosen: str, scenes: Sequence[str]) -> s
     """Return how a setting compares with the first choice, trained with the same seeds, in the mean over scenes."""
     found = dict[str, tuple[float, float, float]]()
     for scene in scenes:
-        own, first = _of(rows, scene, chosen), _of(rows, scene, CHOSEN)
+        own, first = rows_of(rows, scene, chosen), rows_of(rows, scene, CHOSEN)
         pairs = [(own[seed], first[seed]) for seed in sorted(own.keys() & first.keys())]
         ratios = (fmean(a[name] / b[name] for a, b in pairs) for name in ("seconds", "gaussians"))
         found[scene] = fmean(value(a, "test psnr") - value(b, "test psnr") for a, b in pairs), *ratios
@@ -264,11 +273,11 @@ def _against_first(rows: Sequence[Row], chosen: str, scenes: Sequence[str]) -> s
     )
 
 
-def differences(rows: Sequence[Row], references: Path = REFERENCES, *, chosen: str = CHOSEN) -> dict[str, list[float]]:
+def differences(rows: Sequence[Row], references: Path = REFERENCES, *, chosen: str = LATER) -> dict[str, list[float]]:
     """Return by how much a setting is ahead of the plain training of the same seed, test PSNR, by scene."""
     found: dict[str, list[float]] = {}
     for scene in SCENES:
-        own, plain = _of(rows, scene, chosen), _references(rows, references, scene)["plain"]
+        own, plain = rows_of(rows, scene, chosen), _references(rows, references, scene)["plain"]
         if shared := sorted(own.keys() & plain.keys() & set(range(SEEDS))):
             found[scene] = [value(own[seed], "test psnr") - value(plain[seed], "test psnr") for seed in shared]
     return found
@@ -279,7 +288,7 @@ def binocular(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     lines, ahead = [], dict[str, list[float]]()
     for scene in SCENES:
         every = {BINOCULAR: _references(rows, references, scene)[BINOCULAR]}
-        every |= {name: _of(rows, scene, name) for name in (CHOSEN, LATER)}
+        every |= {name: rows_of(rows, scene, name) for name in (CHOSEN, LATER)}
         if not (shared := sorted(set.intersection(*(set(of) for of in every.values())))):
             continue
         figures = {name: [value(of[seed], "test psnr") for seed in shared] for name, of in every.items()}
@@ -301,9 +310,9 @@ def binocular(rows: Sequence[Row], references: Path = REFERENCES) -> str:
 def starts(rows: Sequence[Row]) -> str:
     """Return the table of trainings from other points: both chosen ones, PSNR of held-out and of test views, seed 0."""
     lines = []
-    for start in STARTS.values():
+    for start in ("random points", FEW_AND_RANDOM):
         for scene in SCENES:
-            own, later = (_of(rows, f"{scene}, {start}", name).get(0) for name in (CHOSEN, LATER))
+            own, later = (rows_of(rows, f"{scene}, {start}", name).get(0) for name in (CHOSEN, LATER))
             if own and later:
                 before, after = ((row["held-out"], value(row, "test psnr")) for row in (own, later))
                 lines.append({
@@ -318,7 +327,7 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     """Return the table of the seeds: median, spread and the worst by scene and setting, and how often one fails."""
     lines, counts, below = [], dict[str, list[bool]](), dict[str, list[bool]]()
     for scene in FAILING:
-        every = {name: _of(rows, scene, name) for name in (LATER, CHOSEN)}
+        every = {name: rows_of(rows, scene, name) for name in (LATER, CHOSEN)}
         every |= _references(rows, references, scene)
         figures = {
             name: {seed: value(row, "test psnr") for seed, row in of.items()}
@@ -363,7 +372,8 @@ def _share(of: Sequence[bool]) -> str:
     return f"{sum(of)} of {len(of)} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
-def _of(rows: Sequence[Row], scene: str, name: str) -> dict[int, Row]:
+def rows_of(rows: Sequence[Row], scene: str, name: str) -> dict[int, Row]:
+    """Return the rows of a scene and a candidate by seed."""
     return {row["seed"]: row for row in rows if (row["scene"], row["candidate"]) == (scene, name)}
 
 
@@ -371,7 +381,7 @@ def _references(rows: Sequence[Row], references: Path, scene: str) -> dict[str, 
     """Return what the chosen one is compared with, by name and seed: the grid's rows, and own ones of further seeds."""
     kept = Rows(references / f"{scene}.json")
     return {
-        name: _of(rows, scene, name) | kept.of({"recipe": "3dgs", "iterations": 3_000, **own})
+        name: rows_of(rows, scene, name) | kept.of({"recipe": "3dgs", "iterations": 3_000, **own})
         for name, own in _REFERENCES.items()
     }
 

@@ -1,169 +1,110 @@
-"""Folders of scenes for trainings that start from other points, or with cameras of the training photographs alone.
+"""Trainings that start from other points, or with cameras of the training photographs alone: benchmarks/dense_start.md.
 
-    python -m benchmarks.starts points ../shared/data OUT SCENE...     # OUT/SCENE with a .ply for each start
-    python -m benchmarks.starts cameras ../shared/data OUT SCENE...    # OUT/SCENE-own
+    python -m benchmarks.starts benchmarks/data/setting.json    # where `benchmarks.setting measure` keeps the rows
 
-What comes of them is in benchmarks/dense_start.md and setting.md.
+Their scenes are made by `benchmarks.start_scenes`.
 """
 
 from __future__ import annotations
 
 import json
-import shutil
 import sys
-import tempfile
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from statistics import fmean
 
 import numpy as np
-import torch
-from PIL import Image
-from scipy.spatial import cKDTree
-from torch import Tensor
 
+from benchmarks.paper.rows import value
 from benchmarks.paper.scenes import SCENES
-from reference_trainer.scenes.dense import dense_start
-from reference_trainer.scenes.load import load_scene
-from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.scenes.points import colmap_points, filled, random_points_in_frusta
-from reference_trainer.scenes.poses import LARGEST_SIDE, find_poses
-from reference_trainer.scenes.scene import PointCloud
+from benchmarks.setting import CHOSEN, FEW_AND_RANDOM, LATER, Row, rows_of
+from benchmarks.start_scenes import SIFT
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 
-SIFT = {
-    "fern": "sparse_3views/0", "herz-jesu": "sparse_3near/0", "fountain": "sparse_3near/0",
-    "sceaux": "sparse_3views/0", "cape": "sparse_3views/0",
-}  # fmt: skip
-"""Points that COLMAP found in the training photographs; the other scenes are taken to have none."""
-FEW = 450
-"""So many it finds where it must find the cameras as well."""
-LEAST = 20
-"""So many points place a photograph."""
+__all__ = ["choice", "judgement", "own_cameras", "tables"]
+
+CHOOSING = ("fern", "herz-jesu", "fountain", "sceaux", "cape", "dtu-scan65")
+"""The scenes whose held-out views choose a start."""
+FROM = {CHOSEN: "from 150", LATER: "from 1,000"}
+OWN = "{}-own, dense and few"
 
 
-def with_points(data: Path, out: Path, name: str) -> None:
-    """Write the folder of a scene with links to its files, and a point cloud for every start."""
-    folder = out / name
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in (data / name).resolve().iterdir():
-        if not (folder / path.name).exists():
-            (folder / path.name).symlink_to(path)
-    sift = colmap_points(data / name / SIFT[name]) if name in SIFT else None
-    options = replace(SCENES[name].options, path=str(data / name), points=SIFT.get(name, "random"))
-    train = load_scene(options).train
-    generator = torch.Generator().manual_seed(0)
-    few = PointCloud(torch.empty(0, 3), torch.empty(0, 3), "none", frozenset())
-    if sift is not None:
-        some = torch.randperm(len(sift.positions), generator=generator)[:FEW]
-        few = replace(sift, positions=sift.positions[some], colors=sift.colors[some])
-    both, _ = dense_start(train, few)
-    number = len(both.positions) - len(few.positions)
-    clouds = {"dense": replace(both, positions=both.positions[:number], colors=both.colors[:number])}
-    if sift is not None:
-        clouds |= {"few_and_random": filled(few, train, generator)[0], "dense_and_few": both}
-        clouds |= {"sift": sift, "dense_and_sift": dense_start(train, sift)[0]}
-    cameras = [view.camera for view in train]
-    depths = torch.cat([camera.project(both.positions)[1] for camera in cameras])
-    near, far = depths[depths > 0].quantile(torch.tensor([0.01, 0.99])).tolist()
-    apart = torch.Generator().manual_seed(1)
-    random = random_points_in_frusta(cameras, 5_000, near=near, far=far, generator=apart)
-    more = [torch.cat(pair) for pair in ((both.positions, random.positions), (both.colors, random.colors))]
-    clouds["dense_and_random"] = replace(both, positions=more[0], colors=more[1])
-    for start, cloud in clouds.items():
-        write_points(folder / f"{start}.ply", cloud.positions, cloud.colors)
-        print(f"{name}: {start}, {len(cloud.positions):,} points")
+def choice(rows: Sequence[Row], starts: Sequence[str], seed: int = 0) -> str:
+    """Return the table of starts: PSNR of held-out and of test views, and the gain over the first in the mean."""
+    lines: list[dict[str, str]] = []
+    base = {scene: row for scene in CHOOSING if (row := _rows(rows, scene, starts[0], CHOSEN).get(seed))}
+    for start in starts:
+        for begun in (CHOSEN, LATER):
+            found = {scene: row for scene in base if (row := _rows(rows, scene, start, begun).get(seed))}
+            if not found:
+                continue
+            line = {"points": start, "density control": FROM[begun]}
+            line |= {scene: "{:.2f} / {:.2f}".format(*_figures(row)) for scene, row in found.items()}
+            gains = [np.subtract(_figures(row), _figures(base[scene])) for scene, row in found.items()]
+            line |= {"gain": "{:+.2f} / {:+.2f}".format(*np.mean(gains, 0)), "scenes": str(len(gains))}
+            lines.append(line)
+    columns = ["points", "density control", *base, "gain", "scenes"]
+    return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 
 
-def write_points(path: Path, positions: Tensor, colors: Tensor) -> None:
-    """Write a PLY of colored points."""
-    kinds = {"x": "f4", "y": "f4", "z": "f4", "red": "u1", "green": "u1", "blue": "u1"}
-    columns = [*positions.T.numpy(), *(255 * colors.clamp(0, 1)).round().T.byte().numpy()]
-    rows = np.rec.fromarrays(columns, [*kinds.items()])
-    properties = "".join(f"property {'float' if kind == 'f4' else 'uchar'} {name}\n" for name, kind in kinds.items())
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
-    path.write_bytes(head.encode() + rows.tobytes())
+def judgement(rows: Sequence[Row], start: str) -> str:
+    """Return the table of the chosen start against the one before, test views, with the seeds that both have."""
+    lines, every = [], list[float]()
+    for scene in SCENES:
+        before, after = _rows(rows, scene, FEW_AND_RANDOM, CHOSEN), _rows(rows, scene, start, LATER)
+        if shared := sorted(before.keys() & after.keys()):
+            pairs = [[value(of[seed], "test psnr") for seed in shared] for of in (before, after)]
+            gains = [b - a for a, b in zip(*pairs, strict=True)]
+            every.append(fmean(gains))
+            lines.append({
+                "scene": scene, "seeds": str(len(shared)), "before": format_mean_std(pairs[0], decimals=2),
+                "now": format_mean_std(pairs[1], decimals=2), "gain, by seed": ", ".join(f"{x:+.2f}" for x in gains),
+            })  # fmt: skip
+    table = markdown_table(lines, ["scene", "seeds", "before", "now", "gain, by seed"])
+    return (
+        f"{table}\n\n- mean gain over {len(every)} scenes: {fmean(every):+.1f} dB; least {min(every):+.1f} dB"
+        if every
+        else ""
+    )
 
 
-def with_own_cameras(data: Path, out: Path, name: str) -> None:
-    """Write a folder in which the training photographs tell the cameras, as for ``ca-reg run``, and the others test.
-
-    The others are placed in the reconstruction of the training photographs, which stays as it is: by the points that
-    they share with it, if they are `LEAST` or more.
-    """
-    import pycolmap
-
-    options = SCENES[name].options
-    images = data / name / ("images_8" if name == "fern" else "images")  # of fern those of the README
-    scene = load_scene(replace(options, path=str(data / name), points="random", images=images.name))
-    trained = [Path(view.name).name for view in scene.train]
-    folder, three = out / f"{name}-own", out / f"{name}-own" / "three"
-    (three / "images").mkdir(parents=True)
-    for photo in trained:
-        shutil.copy(images / photo, three / "images" / photo)
-    print(f"{name}: {find_poses(three)}")
-    shutil.copytree(images, folder / "images")
-    model = pycolmap.Reconstruction(three / "sparse/0")
-    trained = [image.name for image in model.images.values()]
-    placed = _placed(model, folder / "images")
-    for number, (photo, camera, pose) in enumerate(placed, start=max(model.images) + 1):
-        model.add_image_with_trivial_frame(pycolmap.Image(name=photo, camera_id=camera, image_id=number), pose)
-    (folder / "sparse/0").mkdir(parents=True)
-    model.write_binary(folder / "sparse/0")
-    split = {"train": sorted(trained), "test": [photo for photo, _, _ in placed]}
-    (folder / "split.json").write_text(json.dumps(split))
-    cloud = load_scene(SceneOptions(str(folder))).points
-    write_points(folder / "dense_and_few.ply", cloud.positions, cloud.colors)
-    print(f"{name}: {len(trained)} photographs tell the cameras, {len(placed)} of the others are placed")
+def own_cameras(rows: Sequence[Row]) -> str:
+    """Return the table of trainings with cameras of three photographs alone: PSNR of the others, and Gaussians."""
+    lines = []
+    for scene in SCENES:
+        starts = {"few and random, from 150": (f"{scene}-own", CHOSEN), "dense, from 1,000": (OWN.format(scene), LATER)}
+        found = {name: row for name, of in starts.items() if (row := rows_of(rows, *of).get(0))}
+        if len(found) == len(starts):
+            figures = {name: value(row, "test psnr") for name, row in found.items()}
+            before, after = figures.values()
+            lines.append({"scene": scene, **{name: f"{x:.2f}" for name, x in figures.items()},
+                          "gain": f"{after - before:+.2f}",
+                          "Gaussians": " / ".join(f"{row['gaussians']:,}" for row in found.values())})  # fmt: skip
+    return markdown_table(lines, ["scene", *starts, "gain", "Gaussians"])
 
 
-def _placed(model: Any, images: Path) -> list[tuple[str, int, Any]]:
-    """Return name, camera and pose of the photographs that a reconstruction lacks and that can be placed in it."""
-    import pycolmap
+def tables(rows: Sequence[Row]) -> list[str]:
+    """Return all tables of the page that come from trainings."""
+    few = [FEW_AND_RANDOM, "dense", "dense and few", "dense, few and random"]
+    return [
+        choice(rows, few),
+        choice(rows, ["SIFT", "dense and SIFT"]),
+        judgement(rows, "dense and few"),
+        own_cameras(rows),
+    ]
 
-    known = {image.name: image for image in model.images.values()}
-    others = sorted(path.name for path in images.iterdir() if path.name not in known)
-    features = pycolmap.FeatureExtractionOptions(max_image_size=LARGEST_SIDE)
-    features.sift.estimate_affine_shape = features.sift.domain_size_pooling = True
-    found = []
-    with tempfile.TemporaryDirectory() as work:
-        path = Path(work) / "database.db"
-        pycolmap.Database.open(path).close()
-        reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE")
-        for name in (*known, *others):
-            pycolmap.import_images(
-                path, images, camera_mode=pycolmap.CameraMode.PER_IMAGE, image_names=[name], options=reader
-            )
-        pycolmap.extract_features(path, images, image_names=[*known, *others], extraction_options=features)
-        pycolmap.match_exhaustive(path)
-        database = pycolmap.Database.open(path)
-        ids = {image.name: image.image_id for image in database.read_all_images()}
-        places = {name: database.read_keypoints(number)[:, :2] for name, number in ids.items()}
-        points: dict[str, dict[int, int]] = {}  # of every known photograph: the point that a feature belongs to
-        for name, image in known.items():
-            own = [(feature.xy, feature.point3D_id) for feature in image.points2D if feature.has_point3D()]
-            distances, nearest = cKDTree([xy for xy, _ in own]).query(places[name])
-            points[name] = {i: own[k][1] for i, (d, k) in enumerate(zip(distances, nearest, strict=True)) if d < 0.05}
-        for name in others:
-            pairs = [
-                (places[name][there], model.points3D[points[photo][here]].xyz)
-                for photo in known
-                for here, there in database.read_two_view_geometry(ids[photo], ids[name]).inlier_matches
-                if here in points[photo]
-            ]
-            with Image.open(images / name) as picture:
-                size = picture.size
-            camera = next(camera for camera in model.cameras.values() if (camera.width, camera.height) == size)
-            if len(pairs) >= LEAST:
-                seen = [np.array(part) for part in zip(*pairs, strict=True)]
-                place = pycolmap.estimate_and_refine_absolute_pose(*seen, camera)
-                if place is not None and place["num_inliers"] >= LEAST:
-                    found.append((name, camera.camera_id, place["cam_from_world"]))
-        database.close()
-    return found
+
+def _figures(row: Row) -> tuple[float, float]:
+    return row["held-out"], value(row, "test psnr")
+
+
+def _rows(rows: Sequence[Row], scene: str, start: str, candidate: str) -> dict[int, Row]:
+    """Return the rows of a start by seed, which at some scenes has another name."""
+    if scene not in SIFT:  # no measured point
+        start = {FEW_AND_RANDOM: "random points", "dense and few": "dense"}.get(start, start)
+    declared = {"lego": "random points", "fountain": "SIFT", "herz-jesu": "SIFT"}.get(scene)
+    return rows_of(rows, scene if start == declared else f"{scene}, {start}", candidate)
 
 
 if __name__ == "__main__":
-    what, *folders = sys.argv[1:4]
-    make = {"points": with_points, "cameras": with_own_cameras}[what]
-    for scene in sys.argv[4:]:
-        make(Path(folders[0]), Path(folders[1]), scene)
+    print(*tables(json.loads(Path(sys.argv[1]).read_text("utf-8"))), sep="\n\n")

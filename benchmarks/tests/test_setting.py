@@ -90,7 +90,9 @@ def test_the_page_has_the_tables_of_its_rows():
 
 
 def test_the_recipe_is_what_was_chosen():
-    assert setting.candidate(with_recipe("sparse", iterations=3_000)) == setting.CHOSEN
+    assert setting.candidate(with_recipe("sparse", iterations=3_000)) == setting.LATER
+    assert setting.candidate(with_recipe("sparse", iterations=2_000)) == setting.LATER
+    assert setting.candidate(with_recipe("sparse", iterations=2_000, densify_from=100)) == setting.CHOSEN
 
 
 def test_a_candidate_of_the_second_choice_gains_over_the_mean_of_the_seeds():

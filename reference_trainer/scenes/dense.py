@@ -18,6 +18,7 @@ from torch import Tensor
 
 from reference_trainer.camera import Camera
 from reference_trainer.files import replacing
+from reference_trainer.progress import progress_bar
 from reference_trainer.scenes.images import resize_image
 from reference_trainer.scenes.scene import PointCloud, View
 
@@ -40,6 +41,7 @@ GUIDES = 50  # points that a view must see to tell its range of depth
 ROUNDS = 3
 SIDE = 4  # pixels over which the sweep's depths give a slope
 NEAR, ALIKE = 1.5, 0.02  # pixels and share of the inverse depth within which two photographs agree
+BAR = {"desc": "points", "unit": "photo", "delay": 2.0}
 SMALL, LARGE = 0.03, 0.35  # costs of a step between planes, where a correlation of -1 costs 1
 
 
@@ -286,7 +288,8 @@ def _depth_maps(pictures: Sequence[_Picture], ranges: Sequence[tuple[float, floa
 
     found: list[_Depths | None] = []
     cameras = [picture.camera for picture in pictures]
-    for number, (picture, span) in enumerate(zip(pictures, ranges, strict=True)):
+    every = zip(pictures, ranges, strict=True)
+    for number, (picture, span) in enumerate(progress_bar(iterable=every, total=len(pictures), **BAR)):
         sources = [] if span is None else source_views(cameras, number, math.sqrt(span[0] * span[1]))
         if span is None or not sources:
             found.append(None)

@@ -131,15 +131,15 @@ RECIPES: dict[str, Recipe] = {
         TrainConfig(
             iterations=3_000,
             sh_every=150,
-            densify_from=150,
+            densify_from=1_000,
             prune_size_from=900,
             opacity_reset_from=600,
             guard=3_000,
             dropout=0.2,
             opacity_decay=0.995,
-        ),  # the schedule of 3dgs at 3,000 steps
+        ),  # the schedule of 3dgs at 3,000 steps, but for the beginning of density control
         "no publication: 3dgs, dropout (Chen et al. 2025), Binocular3DGS's opacity decay and the guard of this package",
-        "nothing; benchmarks/guard.md says how it was chosen",
+        "nothing; benchmarks/setting.md says how it was chosen",
     ),
 }
 """All recipes, by the name that ``--recipe`` knows."""

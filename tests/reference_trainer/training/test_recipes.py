@@ -84,9 +84,9 @@ def absgs(white: bool) -> Iterator[Event]:
             yield iteration, "reset", 0.8  # there before resets, of which the lower one holds in either order
 
 
-def sparse(white: bool) -> Iterator[Event]:  # ours: fsgs at three tenths, with Binocular3DGS's decay
+def sparse(white: bool) -> Iterator[Event]:  # ours: fsgs at three tenths but later, with Binocular3DGS's decay
     for iteration in range(1, 3_000):
-        if iteration > 150:
+        if iteration > 1_000:
             yield iteration, "decay", 0.995
             if iteration % 100 == 0:
                 yield iteration, "densify", 5e-4
@@ -211,10 +211,10 @@ def test_terms_act_when_those_of_the_code_base_do(name, share):
                 assert sum(weights) == pytest.approx(weight(iteration), abs=1e-6), (kind, iteration)
 
 
-def test_sparse_is_3dgs_of_as_many_steps_with_three_options():
-    """Dropout, decay and the guard after the last step, whatever the iterations."""
+def test_sparse_is_3dgs_of_as_many_steps_with_four_options():
+    """Dropout, decay, the guard after the last step and density control from a third on, whatever the iterations."""
     for iterations in (1_000, 1_500, 3_000):
-        options = {"dropout": 0.2, "opacity_decay": 0.995, "guard": iterations}
+        options = {"dropout": 0.2, "opacity_decay": 0.995, "guard": iterations, "densify_from": round(iterations / 3)}
         assert with_recipe("sparse", iterations=iterations) == with_recipe("3dgs", iterations=iterations, **options)
 
 
