@@ -26,7 +26,6 @@ __all__ = ["choice", "judgement", "own_cameras", "tables"]
 CHOOSING = ("fern", "herz-jesu", "fountain", "sceaux", "cape", "dtu-scan65")
 """The scenes whose held-out views choose a start."""
 FROM = {CHOSEN: "from 150", LATER: "from 1,000"}
-OWN = "{}-own, dense and few"
 
 
 def choice(rows: Sequence[Row], starts: Sequence[str], seed: int = 0) -> str:
@@ -60,27 +59,26 @@ def judgement(rows: Sequence[Row], start: str) -> str:
                 "scene": scene, "seeds": str(len(shared)), "before": format_mean_std(pairs[0], decimals=2),
                 "now": format_mean_std(pairs[1], decimals=2), "gain, by seed": ", ".join(f"{x:+.2f}" for x in gains),
             })  # fmt: skip
-    table = markdown_table(lines, ["scene", "seeds", "before", "now", "gain, by seed"])
-    return (
-        f"{table}\n\n- mean gain over {len(every)} scenes: {fmean(every):+.1f} dB; least {min(every):+.1f} dB"
-        if every
-        else ""
-    )
+    if not lines:
+        return f"Nothing of {start!r} was judged."
+    total = f"- mean gain over {len(every)} scenes: {fmean(every):+.1f} dB; the least: {min(every):+.1f} dB"
+    return "\n".join([markdown_table(lines, [*lines[0]]), "", total])
 
 
 def own_cameras(rows: Sequence[Row]) -> str:
     """Return the table of trainings with cameras of three photographs alone: PSNR of the others, and Gaussians."""
     lines = []
     for scene in SCENES:
-        starts = {"few and random, from 150": (f"{scene}-own", CHOSEN), "dense, from 1,000": (OWN.format(scene), LATER)}
-        found = {name: row for name, of in starts.items() if (row := rows_of(rows, *of).get(0))}
-        if len(found) == len(starts):
-            figures = {name: value(row, "test psnr") for name, row in found.items()}
-            before, after = figures.values()
-            lines.append({"scene": scene, **{name: f"{x:.2f}" for name, x in figures.items()},
-                          "gain": f"{after - before:+.2f}",
-                          "Gaussians": " / ".join(f"{row['gaussians']:,}" for row in found.values())})  # fmt: skip
-    return markdown_table(lines, ["scene", *starts, "gain", "Gaussians"])
+        before = rows_of(rows, f"{scene}-own", CHOSEN).get(0)
+        after = rows_of(rows, f"{scene}-own, dense and few", LATER).get(0)
+        if before and after:
+            figures = [value(row, "test psnr") for row in (before, after)]
+            lines.append({
+                "scene": scene, "few and random, from 150": f"{figures[0]:.2f}",
+                "dense and few, from 1,000": f"{figures[1]:.2f}", "gain": f"{figures[1] - figures[0]:+.2f}",
+                "Gaussians": f"{before['gaussians']:,} / {after['gaussians']:,}",
+            })  # fmt: skip
+    return markdown_table(lines, [*lines[0]]) if lines else "Nothing was trained with cameras of its own."
 
 
 def tables(rows: Sequence[Row]) -> list[str]:
