@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class FoundPoses:
     folder: Path  # of the COLMAP model, ``sparse/0`` in the scene
     registered: tuple[str, ...]  # names of the photographs that now have a camera
     left_out: tuple[str, ...]  # names of the others
-    unread: tuple[str, ...]  # names of photographs in a format that is not read, such as HEIC
+    unread: Mapping[str, str]  # why the photographs were not read that were not, by name
     points: int  # number of points
     error: float  # mean reprojection error of their features, pixels of the photographs
     focal: tuple[float, ...]  # focal lengths of the cameras, pixels, sorted
@@ -54,8 +54,7 @@ class FoundPoses:
                 f"left out: {', '.join(self.left_out)}. They share too little with the others: add a photograph from "
                 "in between, or go on without them"
             )
-        if self.unread:
-            lines.append(f"not read: {', '.join(self.unread)}. Save them as JPEG or PNG, and run this again")
+        lines += [f"not read, and left out: {why}" for why in self.unread.values()]
         return "\n".join(lines)
 
 
@@ -70,10 +69,11 @@ def find_poses(
     """Find cameras and points for a folder of photographs, and write them as the COLMAP model ``sparse/0``.
 
     The photographs are those in ``images`` of the scene folder, or in the folder itself. Those of equal size and focal
-    length are taken to share one camera. Below `FEW` photographs, where COLMAP's own settings find little, features use
-    domain-size pooling and affine shapes, points need two photographs instead of three, and the focal lengths are kept
-    if EXIF data give them for all photographs, since so few determine them less well. The model is written atomically,
-    and the result is deterministic.
+    length are taken to share one camera. Those that are damaged or unknown to COLMAP are left out, and named. Below
+    `FEW` photographs, where COLMAP's own settings find little, features use domain-size pooling and affine shapes,
+    points need two photographs instead of three, and the focal lengths are kept if EXIF data give them for all
+    photographs, since so few determine them less well. The model is written atomically, and the result is
+    deterministic.
 
     Args:
         scene: the scene folder.
@@ -85,8 +85,8 @@ def find_poses(
     Raises:
         ImportError: if pycolmap is missing.
         FileNotFoundError: if there is no such folder.
-        ValueError: if it holds fewer than two photographs, one is damaged or unknown to COLMAP, they show too little in
-            common for any camera, or there is no such camera model.
+        ValueError: if it holds fewer than two photographs that can be read, they show too little in common for any
+            camera, or there is no such camera model.
         FileExistsError: if the scene has cameras already, or another photograph of a name.
         OSError: if it cannot be written.
     """
@@ -95,68 +95,92 @@ def find_poses(
         raise ValueError(f"there is no camera model {camera!r}; choose one of {', '.join(known)}.")
     scene = Path(scene)
     out = scene if out is None else Path(out)
-    photos = list_images(scene / "images" if (scene / "images").is_dir() else scene)
-    if len(photos) < 2:
-        raise ValueError(f"{photos[0].parent} holds 1 photograph, and depth needs at least 2: take another one.")
+    folder = scene / "images" if (scene / "images").is_dir() else scene
+    photos, unread = _sorted(folder)
+    _check_number(photos, unread, folder)
     if found := colmap_folders(out):
         raise FileExistsError(f"{out} has cameras already, in {found[0]}: train on it, or delete them to find others.")
     images, place = out / "images", out / "sparse" / "0"
     if place.exists() and any(place.iterdir()):
         raise FileExistsError(f"{place} holds files, but no cameras: delete them, or give another --out.")
-    there = out.resolve() == scene.resolve() or images.resolve() == photos[0].parent.resolve()
+    there = out.resolve() == scene.resolve() or images.resolve() == folder.resolve()
     copies = {} if there else {photo: images / photo.name for photo in photos}
     for photo, copy in copies.items():
         if copy.exists() and not filecmp.cmp(photo, copy):
             raise FileExistsError(f"{images} holds another {photo.name}, which is not overwritten: give another --out.")
-    for photo in photos:
-        decode_image(photo)  # COLMAP takes what is left of a truncated one
     with tempfile.TemporaryDirectory() as work:
-        model = _reconstruct(photos, Path(work), camera, seed, progress)
+        model = _reconstruct(photos, unread, Path(work), camera, seed, progress)
         if model is None:
             raise ValueError(
-                f"none of the {len(photos)} photographs in {photos[0].parent} could be placed: neighboring ones must "
-                "show the same things from places some steps apart, sharp, without much that moves. Add photographs "
+                f"none of the {len(photos)} photographs in {folder} could be placed: neighboring ones must show "
+                "the same things from places some steps apart, sharp, without much that moves. Add photographs "
                 "from in between, or take the poses of VGGT or InstantSplat."
             )
         registered = {image.name for image in model.images.values() if image.has_pose}
         for photo, copy in copies.items():
-            images.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(photo, copy)
+            if photo.name not in unread:
+                images.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(photo, copy)
         _write(model, place)
     return FoundPoses(
         place,
         tuple(photo.name for photo in photos if photo.name in registered),
-        tuple(photo.name for photo in photos if photo.name not in registered),
-        tuple(unreadable_photographs(photos[0].parent)),
+        tuple(photo.name for photo in photos if photo.name not in {*registered, *unread}),
+        unread,
         model.num_points3D(),
         model.compute_mean_reprojection_error(),
         tuple(sorted(camera.mean_focal_length() for camera in model.cameras.values())),
     )
 
 
-def _reconstruct(photos: list[Path], work: Path, camera: str | None, seed: int, progress: bool) -> Any:
-    """Return the reconstruction that registers the most photographs, None if there is none."""
+def _sorted(folder: Path) -> tuple[list[Path], dict[str, str]]:
+    """Return the photographs of a folder that can be read, and by name what is wrong with the others."""
+    photos = list_images(folder)
+    unread = {name: f"{name}: save it as JPEG or PNG" for name in unreadable_photographs(folder)}
+    for photo in photos:
+        try:
+            decode_image(photo)  # COLMAP takes what is left of a truncated one
+        except ValueError as error:
+            unread[photo.name] = str(error)
+    return [photo for photo in photos if photo.name not in unread], unread
+
+
+def _check_number(photos: list[Path], unread: Mapping[str, str], folder: Path) -> None:
+    """Refuse fewer than two photographs with a ValueError."""
+    if len(photos) < 2:
+        held = f"{len(photos) or 'no'} photograph{'' if len(photos) == 1 else 's'}{' that can be read' * bool(unread)}"
+        others = f" Not read: {'; '.join(unread.values())}." * bool(unread)
+        raise ValueError(f"{folder} holds {held}, and depth needs at least 2: take another one.{others}")
+
+
+def _reconstruct(
+    photos: list[Path], unread: dict[str, str], work: Path, camera: str | None, seed: int, progress: bool
+) -> Any:
+    """Return the reconstruction that registers the most photographs, None if there is none.
+
+    What COLMAP cannot read is left out and added to ``unread``.
+    """
     try:
         import pycolmap
     except ImportError as error:
         raise ImportError("finding cameras needs pycolmap: pip install 'ca_reg[colmap]'.") from error
-    few, folder, database = len(photos) < FEW, photos[0].parent, work / "database.db"
+    folder, database = photos[0].parent, work / "database.db"
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.set_random_seed(seed)
+    taken_with = {}
+    for photo in photos:
+        try:
+            taken_with[photo] = pycolmap.infer_camera_from_image(photo)
+        except (RuntimeError, ValueError):
+            unread[photo.name] = f"COLMAP cannot read {photo}, WebP for one: save it as JPEG or PNG"
+    _check_number(photos := list(taken_with), unread, folder)
+    few, alike = len(photos) < FEW, defaultdict(list)
+    known = all(taken.has_prior_focal_length for taken in taken_with.values())
+    for photo, taken in taken_with.items():
+        alike[(*image_size(photo), taken.mean_focal_length())].append(photo.name)
     reader = pycolmap.ImageReaderOptions(camera_model=camera or ("SIMPLE_PINHOLE" if few else "SIMPLE_RADIAL"))
     features = pycolmap.FeatureExtractionOptions(max_image_size=LARGEST_SIDE)
     features.sift.estimate_affine_shape = features.sift.domain_size_pooling = few
-    alike, known = defaultdict(list), True
-    for photo in photos:
-        size = image_size(photo)
-        try:
-            taken_with = pycolmap.infer_camera_from_image(photo)
-        except (RuntimeError, ValueError) as error:
-            raise ValueError(
-                f"COLMAP cannot read {photo}, WebP for one: save the photographs as JPEG or PNG."
-            ) from error
-        known = known and taken_with.has_prior_focal_length
-        alike[(*size, taken_with.mean_focal_length())].append(photo.name)
     pycolmap.Database.open(database).close()
     for names in alike.values():  # in a fixed order: image numbers are part of the result
         pycolmap.import_images(

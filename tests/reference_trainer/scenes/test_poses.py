@@ -127,31 +127,10 @@ def test_photographs_without_cameras_are_told_how_to_get_them(noise, capsys):
     assert (said[1], shlex.split(said[2])) == (str(photos), ["ca-reg", "poses", str(photos)])
 
 
-@pytest.mark.parametrize(
-    ("kind", "error"),
-    [("WEBP", r"COLMAP cannot read .*0\.webp, .*: save the photographs as JPEG"), ("", "not a readable")],
-)
-def test_a_photograph_that_cannot_be_read_is_named(noise, kind, error):
-    pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
-    if kind:
-        Image.new("RGB", (40, 30)).save(noise / "0.webp", kind)
-    else:
-        (noise / "0.png").write_text("no picture")
-    with pytest.raises(ValueError, match=error):
-        find_poses(noise)
-
-
 def cut_off(path):
     """Write a JPEG that ends in the middle, as an interrupted copy does; its header is whole."""
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)).save(path, "JPEG")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-def test_a_truncated_photograph_is_named_before_colmap_works(noise, monkeypatch):
-    cut_off(noise / "3.jpg")
-    monkeypatch.setattr(poses, "_reconstruct", lambda *_: pytest.fail("COLMAP was started"))
-    with pytest.raises(ValueError, match=r"3\.jpg is not a readable image: .*truncated"):
-        find_poses(noise)
 
 
 def reconstruction():
@@ -159,6 +138,7 @@ def reconstruction():
     return SimpleNamespace(
         images={i: SimpleNamespace(name=f"{i}.png", has_pose=True) for i in range(3)},
         cameras={0: SimpleNamespace(mean_focal_length=lambda: 50.0)},
+        num_reg_images=lambda: 3,
         num_points3D=lambda: 3,
         compute_mean_reprojection_error=lambda: 0.5,
         write_binary=lambda folder: None,
@@ -171,7 +151,42 @@ def test_a_photograph_of_another_format_is_not_passed_over_in_silence(noise, mon
     monkeypatch.setattr(poses, "_reconstruct", lambda *_: reconstruction())
     said = str(find_poses(noise))
     assert "3 of 4 photographs registered" in said
-    assert "not read: IMG_3.HEIC. Save them as JPEG or PNG" in said
+    assert "not read, and left out: IMG_3.HEIC: save it as JPEG or PNG" in said
+
+
+def test_photographs_that_cannot_be_read_are_left_out_and_all_are_named(noise, tmp_path, monkeypatch):
+    """`ca-reg run` does so with the same folder; one that is cut short COLMAP would take for what is left of it."""
+    cut_off(noise / "3.jpg")
+    (noise / "4.png").write_text("no picture")
+    given = []
+    monkeypatch.setattr(poses, "_reconstruct", lambda photos, *_: given.extend(photos) or reconstruction())
+    found = find_poses(noise, tmp_path / "scene")
+    assert [path.name for path in given] == ["0.png", "1.png", "2.png"]
+    assert (found.left_out, {*found.unread}) == ((), {"3.jpg", "4.png"})
+    assert re.search(
+        r"^3 of 5 photographs .*left out: .*3\.jpg is not a readable image: .*truncated.*4\.png is not a readable",
+        str(found),
+        re.DOTALL,
+    )
+    assert sorted(path.name for path in (tmp_path / "scene/images").iterdir()) == ["0.png", "1.png", "2.png"]
+
+
+def test_what_only_colmap_cannot_read_is_left_out_too(noise, monkeypatch):
+    pycolmap = pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
+    Image.new("RGB", (40, 30)).save(noise / "3.webp")
+    monkeypatch.setattr(poses, "_watched", lambda *_, **__: None)
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, **__: {0: reconstruction()})
+    said = str(find_poses(noise))
+    assert "3 of 4 photographs registered" in said
+    assert re.search(r"left out: COLMAP cannot read .*3\.webp, .*: save it as JPEG", said)
+
+
+def test_two_photographs_must_remain(noise, monkeypatch):
+    monkeypatch.setattr(poses, "_reconstruct", lambda *_: pytest.fail("COLMAP was started"))
+    cut_off(noise / "0.png")
+    (noise / "1.png").write_text("no picture")
+    with pytest.raises(ValueError, match=r"holds 1 photograph that can be read, .*at least 2.*0\.png is .*1\.png is"):
+        find_poses(noise)
 
 
 def test_the_folder_of_the_photographs_becomes_that_of_a_scene(noise, monkeypatch):
