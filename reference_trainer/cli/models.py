@@ -101,8 +101,8 @@ class Render:
     mask: float | None = None
     """With --what error: also write masks, white where the expected error is above this, such as 0.05: where to repaint
     (an absolute difference of colors in [0, 1])."""
-    frames: int = 60
-    """Pictures of a flight."""
+    frames: int | None = None
+    """With --what flight: its pictures, by default 60."""
     out: Path | None = None
     """Folder for the pictures; by default <run>/render_<what>."""
     trust: Trust = ()
@@ -116,13 +116,15 @@ class Render:
         if self.mask is not None and not (self.what == "error" and 0 < self.mask < 1):
             got = f"--what {self.what} --mask {self.mask:g}"
             raise ValueError(f"--mask needs --what error and a threshold in (0, 1), got {got}.")
+        if self.frames is not None and self.what != "flight":
+            raise ValueError(f"--frames needs --what flight, got --what {self.what}.")
 
     def __call__(self) -> None:
         from reference_trainer.runs.measure import render_run
 
         self.rendering.begin(self.device)
-        shared: dict[str, Any] = {"frames": self.frames, "device": self.device, "trust": self.trust}
-        render_run(self.run, self.what, self.out, mask=self.mask, **shared)
+        shared: dict[str, Any] = {"mask": self.mask, "device": self.device, "trust": self.trust}
+        render_run(self.run, self.what, self.out, frames=60 if self.frames is None else self.frames, **shared)
 
 
 @dataclass(frozen=True)

@@ -215,6 +215,9 @@ def test_what_would_be_lost_is_refused(trained, capsys, tmp_path):
     assert "is no plan of ca-reg" in refused(["plan", "--out", str(tmp_path / "plan.json")], capsys)
     assert "holds test_0.png" in refused(["render", str(trained), "--what", "test", "--out", garden], capsys)
     assert (tmp_path / "test_0.png").read_text() == "a photograph"
+    for what in ("auto", "train", "error"):
+        text = refused(["render", str(trained), "--what", what, "--frames", "3", "--out", garden], capsys)
+        assert f"--frames needs --what flight, got --what {what}." in text
     for _ in range(2):  # its own pictures may be written again
         main(["render", str(trained), "--what", "test"])
 
