@@ -25,7 +25,7 @@ from ca_reg.functional import scale_opacity
 from ca_reg.regularizer import Params
 from ca_reg.result import new_axes, summarize
 from ca_reg.score import CAScore
-from ca_reg.sinks import Sinks
+from ca_reg.sinks import Sinks, check_sinks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -107,6 +107,7 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         for name, fn in (("psnr", psnr), ("details", details)):
             if fn is not None:
                 check_callable(fn, name)
+        check_sinks(sinks)
         if not isinstance(views, Mapping):
             raise TypeError(f"views must be a mapping from names to views, got {type(views).__name__}.")
         self.views = {name: list(group) for name, group in views.items()}

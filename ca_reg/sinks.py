@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-__all__ = ["MLflowSink", "Sink", "Sinks", "WandbSink"]
+__all__ = ["MLflowSink", "Sink", "Sinks", "WandbSink", "check_sinks"]
 
 
 class Sink:
@@ -42,6 +42,17 @@ class Sink:
     def _log(self, name: str, x: Any, step: int) -> None:
         """Log a number, a picture (H, W, 3) of bytes, numbers (N,), or text."""
         raise NotImplementedError
+
+
+def check_sinks(sinks: Any) -> None:
+    """Raise a TypeError unless these are several objects, none or more, with the methods of :class:`Sink`."""
+    if not isinstance(sinks, list | tuple):
+        raise TypeError(f"sinks must be a list, such as [WandbSink()], got {type(sinks).__name__}.")
+    methods = [name for name in vars(Sink) if not name.startswith("_")]
+    for sink in sinks:
+        if isinstance(sink, type) or not all(callable(getattr(sink, name, None)) for name in methods):
+            got = f"the class {sink.__name__}" if isinstance(sink, type) else type(sink).__name__
+            raise TypeError(f"sinks must have the methods {', '.join(methods)}, such as WandbSink(), got {got}.")
 
 
 class Sinks:

@@ -235,6 +235,10 @@ def test_closing_twice_is_fine_and_using_it_then_is_an_error(tmp_path):
         ({"resume_step": -1}, ValueError),
         ({"psnr": 30.0}, TypeError),
         ({"details": True}, TypeError),
+        ({"sinks": [3]}, TypeError),
+        ({"sinks": [Sink]}, TypeError),  # the class
+        ({"sinks": Sink()}, TypeError),
+        ({"sinks": "wandb"}, TypeError),
     ],
 )
 def test_wrong_arguments_are_refused_before_a_file_is_touched(tmp_path, arguments, error):
