@@ -85,8 +85,10 @@ def _by_leaves(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     low, high = places.amin(1), places.amax(1)
 
     def gaps(rows: Tensor) -> Tensor:
-        """Return the squared distances of these boxes to all, (rows, leaves)."""
-        return torch.maximum(low[rows, None] - high, low - high[rows, None]).clamp_min_(0).square_().sum(-1)
+        """Return the squared distances of these boxes to all, (rows, leaves); below 0 to itself if none is nearer."""
+        found = torch.maximum(low[rows, None] - high, low - high[rows, None]).clamp_min_(0).square_().sum(-1)
+        found[every[: len(rows)], rows] -= (reach[rows] == 0).to(found)
+        return found
 
     def search(rows: Tensor, leaves: Tensor) -> tuple[Tensor, Tensor]:
         """Return squared distances and indices of the nearest points of these leaves, (rows, some), for each row's."""
@@ -101,9 +103,10 @@ def _by_leaves(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     every = torch.arange(len(ids), device=points.device)
     pairs = ids.shape[1] ** 2  # of the points of two leaves
     own = [search(some, some[:, None])[0].amax((1, 2)) for some in torch.split(every, max(1, CHUNK_ELEMENTS // pairs))]
-    reach = torch.cat(own) * (1 + 1e-5)  # rounded up: single precision must not lose a tie
+    # Rounded up: single precision must not lose a tie. Points at one place, which may be thousands, reach no further.
+    reach = torch.cat(own) * (1 + 1e-5)
     within = [
-        (gaps(some) <= reach[some, None]).sum(1) for some in torch.split(every, max(1, CHUNK_ELEMENTS // len(ids)))
+        (gaps(some) < reach[some, None]).sum(1) for some in torch.split(every, max(1, CHUNK_ELEMENTS // len(ids)))
     ]
     finite = (high - low).square().sum(1).isfinite()  # else a point may find itself, or what fills a leaf
     numbers, order = (torch.cat(within) * finite).sort(descending=True)

@@ -131,6 +131,19 @@ def test_neighbor_distance_of_near_duplicates_far_from_the_origin():
     torch.testing.assert_close(got.double(), brute_force(positions), rtol=1e-4, atol=0)
 
 
+def test_points_at_one_place_are_not_all_compared_with_all(monkeypatch):
+    """20,000 took 8 s. A few others lie around them, whose boxes hold some of both."""
+    compared, cdist = [], torch.cdist
+    monkeypatch.setattr(neighbors, "CHUNK_ELEMENTS", 10_000)  # else many boxes are searched as far as one of them
+    monkeypatch.setattr(torch, "cdist", lambda *args, **kwargs: compared.append(cdist(*args, **kwargs)) or compared[-1])
+    points = _points("one place", 3000)
+    points[::100] += _points("spread", 30)
+    squares, numbers = nearest_neighbors(points, 3)
+    assert sum(distances.numel() for distances in compared) < 0.2 * 3000**2
+    monkeypatch.undo()
+    _check(squares, numbers, points, 3)
+
+
 def test_duplicates_get_the_floor():
     assert torch.equal(rms_neighbor_distance(torch.ones(5, 3)), torch.full((5,), 1e-7).sqrt())
 
