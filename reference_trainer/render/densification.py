@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ca_reg._precision import at_least_single
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, NEAR_PLANE
 from reference_trainer.render.renderer import rasterize
@@ -26,8 +27,9 @@ CUDA_TILE = 16
 
 def in_front(means: Tensor, camera: Camera) -> Tensor:
     """Return which Gaussians, means (N, 3), lie beyond the near plane, shape (N,) bool."""
+    means = at_least_single(means.detach())
     pose = camera.world_to_camera.to(means)
-    return means.detach() @ pose[2, :3] + pose[2, 3] > NEAR_PLANE
+    return means @ pose[2, :3] + pose[2, 3] > NEAR_PLANE
 
 
 @torch.no_grad()
@@ -53,7 +55,8 @@ def visible_radii(
     """Return the radii of splats on the screen, pixels, (N,) int32; 0 for those off the image.
 
     As in the originals the opacity does not matter: a Gaussian of opacity 0 has a radius, though it
-    is not rendered. Quaternions are wxyz, scales standard deviations, ``blur`` is in square pixels.
+    is not rendered. Quaternions are wxyz, scales standard deviations, ``blur`` is in square pixels. As for a rendering
+    the work is done in float64 if the means are, else in float32.
 
     Example:
         >>> camera = Camera(torch.eye(4), 50.0, 50.0, 16.0, 16.0, 32, 32)
@@ -61,6 +64,8 @@ def visible_radii(
         >>> visible_radii(means, torch.eye(4)[:1].repeat(3, 1), torch.full((3, 3), 0.1), camera).tolist()
         [16, 0, 0]
     """
+    means = at_least_single(means)
+    quaternions, scales = quaternions.to(means), scales.to(means)
     radii = torch.zeros(means.shape[0], dtype=torch.int32, device=means.device)
     front = torch.nonzero(in_front(means, camera)).squeeze(1)
     camera = camera.to(means.device, means.dtype)

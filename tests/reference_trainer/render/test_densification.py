@@ -46,6 +46,17 @@ def test_radii_equal_the_definition(size):
     assert 0 < expected.count(0) < 150
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_has_the_radii_of_its_numbers(dtype):
+    """As the picture has: in half precision itself a large splat's variance is infinite, and its radius -2147483648."""
+    scene = random_scene(150, 700, 450, seed=2, size=0.3)
+    means, quaternions, scales = (x.to(dtype) for x in (1.6 * scene.means, scene.quaternions, scene.scales))
+    expected = visible_radii(means.float(), quaternions.float(), scales.float(), scene.camera)
+    assert expected.max() > 3_000
+    assert torch.equal(visible_radii(means, quaternions, scales, scene.camera), expected)
+    assert torch.equal(visible_radii(means.float(), quaternions, scales, scene.camera), expected)
+
+
 def test_in_front_is_the_near_plane():
     scene = random_scene(60, 20, 20, seed=3)
     depths = [(scene.camera.world_to_camera[:3, :3] @ x + scene.camera.world_to_camera[:3, 3])[2] for x in scene.means]
