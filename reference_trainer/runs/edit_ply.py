@@ -17,7 +17,7 @@ from reference_trainer.evaluation.tables import EXACT, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing
 from reference_trainer.model.ply import save_ply
-from reference_trainer.runs.ply import load_for_views, load_plain_ply_model, load_ply_model, scaled
+from reference_trainer.runs.ply import load_for_views, load_plain_ply_model, load_ply_model, log_other_frame, scaled
 from reference_trainer.runs.run import save_for_viewers
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 from reference_trainer.scenes.scene import Scene
@@ -124,7 +124,7 @@ def clean_ply(
     in (0, 1), of all Gaussians is removed; those without a share stay. The removal leaves holes, which ``refine``
     training steps on the photographs close, without densification and with the regularizers of the model: by default
     100, or none with ``hanging``, which leaves no holes, or without a scene. Logs a table of quality and co-adaptation
-    before and after, and says so if the photographs are fitted worse. Returns the evaluations by row of the table.
+    before and after, and says so if the photographs are fitted worse, or the model is none of the scene. Returns the evaluations by row of the table.
 
     ``where`` is the model's scene, or an orbit around it; opacities are written plain. ``anyway`` cleans a model that
     was trained with dropout, too, which made all measured ones worse. The rest is as in `score_ply`.
@@ -169,6 +169,8 @@ def clean_ply(
     *_, last = models.values()
     save_ply(scaled(last.gaussians, 1 / loaded.enlarged), out, regularizer=last.regularizer, step=last.step)
     _log.info(_table(found))
+    if scene is not None:
+        log_other_frame(found["as it was"], scene, ply)
     before, *_, after = (evaluation.mean("train", "psnr") for evaluation in found.values())
     if round(after, 2) < round(before, 2):  # as they are shown
         _log.warning("The photographs of the training are fitted worse than before: %.2f dB, for %.2f.", after, before)

@@ -29,7 +29,7 @@ from reference_trainer.scenes.virtual_cameras import bounding_sphere, measured_v
 
 __all__ = [
     "ModelWithViews", "PlyFacts", "check_frame", "load_for_views", "load_plain_ply_model", "load_ply_model",
-    "scaled", "score_ply",
+    "log_other_frame", "scaled", "score_ply",
 ]  # fmt: skip
 
 _log = logging.getLogger(__name__)
@@ -193,11 +193,8 @@ def score_ply(
             "An orbit sees the model from where no photograph may have been taken: compare these scores with others "
             "from the same cameras alone; for those of the scene's own views give the scene (--scene FOLDER)."
         )
-    elif _worse_than_one_color(result, scene):
-        _log.info(
-            f"Every training view is further from its photograph than a picture of one color would be: {ply} is not "
-            f"in the frame of {scene.name}, or not a model of it. The PSNR says nothing, CA is that of these views."
-        )
+    else:
+        log_other_frame(result, scene, ply)
     return result
 
 
@@ -233,15 +230,19 @@ def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
     )
 
 
-def _worse_than_one_color(result: Evaluation, scene: Scene) -> bool:
-    """Whether every training view has a lower PSNR than the mean color of the pixels of its photograph that count."""
+def log_other_frame(result: Evaluation, scene: Scene, ply: Path) -> None:
+    """Log it if a model fits no training view as well as the mean color of the pixels of its photograph that count."""
 
     def of_mean(view: View) -> float:
         pixels = counted(view.image, view.mask)[:, None]
         return psnr(pixels.mean(2, keepdim=True).expand_as(pixels), pixels)
 
     limits = {view.name: of_mean(view) for view in scene.train}
-    return bool(limits) and all(v.psnr < limits[v.name] for v in result.views if v.split == "train")
+    if limits and all(v.psnr < limits[v.name] for v in result.views if v.split == "train"):
+        _log.info(
+            f"Every training view is further from its photograph than a picture of one color would be: {ply} is not "
+            f"in the frame of {scene.name}, or not a model of it. The PSNR says nothing, CA is that of these views."
+        )
 
 
 NEARLY_NONE = 0.01

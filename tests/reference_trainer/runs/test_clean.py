@@ -120,6 +120,17 @@ def test_a_worse_fit_is_said(run, options, tmp_path, said):
     assert any(f"fitted worse than before: {after:.2f} dB, for {before:.2f}" in text for text in said)
 
 
+def test_a_model_of_another_scene_is_named_as_by_an_evaluation(run, options, tmp_path, said):
+    """It is in the pictures, so only the photographs can tell."""
+    right = load_ply(run[0] / PLY).gaussians
+    negative = dataclasses.replace(right, sh_dc=-4 * right.sh_dc, opacity_logits=right.opacity_logits + 4)
+    for name, gaussians in (("right", right), ("other", negative)):
+        save_ply(gaussians, tmp_path / f"{name}.ply")
+        clean_ply(tmp_path / f"{name}.ply", options, tmp_path / f"{name}_clean.ply", refine=0)
+    (doubt,) = (text for text in said if "a picture of one color" in text)
+    assert f"{tmp_path / 'other.ply'} is not in the frame of synthetic" in doubt
+
+
 def test_a_fit_that_looks_the_same_is_not_said_to_be_worse(run, options, tmp_path, said, monkeypatch):
     """The guard took 3 of 14,214: "fitted worse than before: 12.56 dB, for 12.56"."""
     measured = iter([12.561, 12.559])
