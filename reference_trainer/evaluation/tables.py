@@ -28,8 +28,8 @@ EXACT = "exact CA (1e-3)"
 _ABSENT = "n/a"
 _FIGURE = re.compile(r"[-+]?\d|-?$")  # also a dash or nothing in its place
 _SHOWN: dict[str, tuple[str, int]] = {
-    "psnr": ("PSNR", 2),
-    "psnr_expected": ("expected PSNR", 1),
+    "psnr": ("PSNR (dB)", 2),
+    "psnr_expected": ("expected PSNR (dB)", 1),
     "psnr_low": ("from", 1),
     "psnr_high": ("to (80 %)", 1),
     "ssim": ("SSIM", 3),
@@ -54,7 +54,7 @@ _NOT_EVERYWHERE = (
     "psnr", "psnr_expected", "psnr_low", "psnr_high", "ssim", "lpips",
     "depth_abs_rel", "depth_rmse", "depth_mae", "depth_log10",
 )  # fmt: skip
-_HIGHEST_IS_BEST = {"PSNR": True, "SSIM": True, "LPIPS": False, EXACT: False, "depth AbsRel": False}
+_HIGHEST_IS_BEST = {"PSNR (dB)": True, "SSIM": True, "LPIPS": False, EXACT: False, "depth AbsRel": False}
 
 
 def evaluation_table(data: Mapping[str, Any]) -> str:

@@ -28,16 +28,16 @@ __all__ = [
 
 _USUAL = TrainConfig()
 _COLUMNS = [  # split, key, title, decimals, unit, whether the highest is best; None where neither end is a merit
-    ("test", "psnr", "PSNR", 2, 1.0, True),
-    ("test", "psnr_expected", "expected PSNR", 1, 1.0, None),
+    ("test", "psnr", "PSNR (dB)", 2, 1.0, True),
+    ("test", "psnr_expected", "expected PSNR (dB)", 1, 1.0, None),
     ("test", "ssim", "SSIM", 3, 1.0, True),
     ("test", "lpips", "LPIPS", 3, 1.0, False),
     ("test", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, False),
-    ("between", "psnr_expected", "expected PSNR", 1, 1.0, None),
-    ("around", "psnr_expected", "expected PSNR", 1, 1.0, None),
+    ("between", "psnr_expected", "expected PSNR (dB)", 1, 1.0, None),
+    ("around", "psnr_expected", "expected PSNR (dB)", 1, 1.0, None),
     ("between", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, False),
     ("around", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, False),
-    ("train", "psnr", "PSNR", 2, 1.0, None),
+    ("train", "psnr", "PSNR (dB)", 2, 1.0, None),
     ("train", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, None),
     ("", "gaussians", "Gaussians", 0, 1.0, None),
     ("", "seconds", "seconds", 0, 1.0, None),

@@ -201,7 +201,7 @@ def _table(found: dict[str, Evaluation]) -> str:
         row: dict[str, object] = {"model": name, "Gaussians": evaluation.gaussians}
         for split in dict.fromkeys(view.split for view in evaluation.views):
             psnr, exact = evaluation.mean(split, "psnr"), evaluation.mean(split, "ca_exact_half") * 1e3
-            row |= {f"{split} PSNR": f"{psnr:.2f}", f"{split} {EXACT}": f"{exact:.2f}"}
+            row |= {f"{split} PSNR (dB)": f"{psnr:.2f}", f"{split} {EXACT}": f"{exact:.2f}"}
         rows.append(row)
     known = [title for title in rows[0] if any(row[title] != "nan" for row in rows)]
     return markdown_table(rows, known)

@@ -135,11 +135,11 @@ def test_decimals_are_the_same_down_a_column():
 NAMES = [f"test quantity {i}" for i in range(12)]
 WIDE = markdown_table(
     [
-        {"strategy": name, "test PSNR": f"{20 + row}.00"}
+        {"strategy": name, "test PSNR (dB)": f"{20 + row}.00"}
         | {each: f"{row + i:.2f} ± 0.10" for i, each in enumerate(NAMES)}
         for row, name in enumerate(("baseline", "dropout"))
     ],
-    ["strategy", *NAMES, "test PSNR"],
+    ["strategy", *NAMES, "test PSNR (dB)"],
 )
 
 

@@ -79,7 +79,7 @@ def test_the_tables_are_those_of_the_runs(pair):
             shown = page_module.view_name(view["split"], view["name"])
             assert f"| {shown} | {view['psnr']:.2f} |" in page.data["perView"][name]
         column = page.data["scores"][0]
-        assert (column["split"], column["title"]) == ("test", "PSNR")
+        assert (column["split"], column["title"]) == ("test", "PSNR (dB)")
         assert column["cells"][i]["text"] == f"{results['mean']['test']['psnr']:.2f}"
         assert f"{name}: 11 steps with dropout(0.2) + noise(0.3" in " ".join(page.data["about"])
         assert f"| {name} | " in page.data["attribution"]
@@ -346,12 +346,12 @@ def test_two_trainings_side_by_side(tmp_path, capsys):
     (tmp_path / "plain/seed_2/results.json").rename(tmp_path / "later")  # not finished yet
     main(["diff", str(tmp_path / "plain"), str(tmp_path / "dropout")])
     said = capsys.readouterr().out
-    assert "| test PSNR | 20.05 ± 0.07 | 21.10 ± 0.10 | +1.05 | unknown |" in said
+    assert "| test PSNR (dB) | 20.05 ± 0.07 | 21.10 ± 0.10 | +1.05 | unknown |" in said
     assert "Seeds: 2 and 3; too few" in said
     assert "differ in iterations" in said
     (tmp_path / "later").rename(tmp_path / "plain/seed_2/results.json")
     main(["diff", str(tmp_path / "plain"), str(tmp_path / "dropout")])
-    assert "| test PSNR | 20.10 ± 0.10 | 21.10 ± 0.10 | +1.00 ± 0.16 | yes, better |" in capsys.readouterr().out
+    assert "| test PSNR (dB) | 20.10 ± 0.10 | 21.10 ± 0.10 | +1.00 ± 0.16 | yes, better |" in capsys.readouterr().out
 
     other = trained(tmp_path / "other", 0, 25.0, test=("test_1",))
     rows, notes = compare_two(tmp_path / "plain/seed_0", other)

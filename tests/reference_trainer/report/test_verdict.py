@@ -126,7 +126,7 @@ def test_the_best_and_the_better_are_marked_where_that_is_a_merit():
 def test_what_an_older_version_did_not_measure_has_no_interval():
     old, new = rows("Old", [20.0], [0.004]), rows("New", [20.0], [0.004])
     new.results[0]["mean"]["test"] |= {"psnr_expected": 19.0, "psnr_low": 17.5, "psnr_high": 20.5}
-    (cells,) = (of["cells"] for of in score_columns([old, new]) if of["title"] == "expected PSNR")
+    (cells,) = (of["cells"] for of in score_columns([old, new]) if of["title"] == "expected PSNR (dB)")
     assert cells[0] == {"text": "n/a", "best": False}
     assert (cells[1]["text"], cells[1]["interval"]) == ("19.0", "17.5 to 20.5")
 
@@ -136,7 +136,7 @@ def test_two_trainings_are_told_apart_by_three_seeds_and_not_by_fewer():
     two = rows("Two", [20.5, 20.7, 20.6], [0.0051, 0.005, 0.0049])
     psnr, ca, *_ = differences(one, two)
     error = 2 * math.sqrt(2 * 0.1**2 / 3)
-    assert psnr["score"] == "test PSNR"
+    assert psnr["score"] == "test PSNR (dB)"
     assert psnr["difference"] == f"+0.50 ± {error:.2f}"
     assert (psnr["told apart"], ca["told apart"]) == ("yes, better", "no")
     assert (psnr["One"], psnr["Two"]) == ("20.10 ± 0.10", "20.60 ± 0.10")

@@ -63,17 +63,17 @@ def test_the_table_has_mean_and_sample_deviation():
     first, second = cells(comparison_table(runs))
     assert first["strategy"] == "baseline"
     assert first["seeds"] == "3"
-    assert first["test PSNR"] == "19.00 ± 1.00"
+    assert first["test PSNR (dB)"] == "19.00 ± 1.00"
     assert first["test exact CA (1e-3)"] == "2.00 ± 0.00"
     assert first["Gaussians"] == "2000 ± 1000"
-    assert second["test PSNR"] == "21.00"
+    assert second["test PSNR (dB)"] == "21.00"
     assert "test LPIPS" not in first  # measured nowhere
-    assert "train PSNR" not in first
+    assert "train PSNR (dB)" not in first
 
 
 def test_a_quality_that_one_strategy_lacks():
     first, second = cells(comparison_table({"a": [made(None)], "b": [made(20.0)]}))
-    assert (first["test PSNR"], second["test PSNR"]) == ("n/a", "20.00")
+    assert (first["test PSNR (dB)"], second["test PSNR (dB)"]) == ("n/a", "20.00")
 
 
 def test_the_table_says_how_many_seeds_have_a_score(tmp_path):
@@ -81,7 +81,7 @@ def test_the_table_says_how_many_seeds_have_a_score(tmp_path):
     write_json(tmp_path / "results.json", made(math.nan))
     unknown = json.loads((tmp_path / "results.json").read_text())
     (row,) = cells(comparison_table({"a": [made(18.0), unknown, made(20.0)]}))
-    assert (row["seeds"], row["test PSNR"]) == ("3", "19.00 ± 1.41 (2 of 3)")
+    assert (row["seeds"], row["test PSNR (dB)"]) == ("3", "19.00 ± 1.41 (2 of 3)")
 
 
 def test_strategies_change_the_regularizers_only():
@@ -315,7 +315,7 @@ def test_a_comparison_from_photographs_to_figures(tmp_path, options, said):
     rows = {row["strategy"]: row for row in cells((tmp_path / TABLE).read_text())}
     for name, runs in comparison.runs.items():
         values = [run["mean"]["test"]["psnr"] for run in runs]
-        mean, spread = (float(x) for x in rows[name]["test PSNR"].split(" ± "))
+        mean, spread = (float(x) for x in rows[name]["test PSNR (dB)"].split(" ± "))
         assert mean == pytest.approx(statistics.mean(values), abs=0.05)
         assert spread == pytest.approx(statistics.stdev(values), rel=0.06, abs=0.0051)  # half of the last digit shown
     stored = json.loads((tmp_path / COMPARISON).read_text())

@@ -143,7 +143,7 @@ def test_the_table_has_one_row_per_view_and_the_means():
     ]
     lines = evaluation_table(Evaluation(views, 9, "vgg").as_dict()).splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    head = ["view", "PSNR", "SSIM", "LPIPS", EXACT, "exact CA at its own drop rate (1e-3)",
+    head = ["view", "PSNR (dB)", "SSIM", "LPIPS", EXACT, "exact CA at its own drop rate (1e-3)",
             "neutral CA at its own drop rate (1e-3)", "CA (5 renders) (1e-3)", "its std error (1e-3)", "visible",
             "covered", "CV"]  # fmt: skip
     assert cells[0] == head
