@@ -218,6 +218,13 @@ class Scheduled(nn.Module):
             # A new tensor, because one created in inference mode cannot be overwritten outside it.
             self._rate = torch.tensor(self._present_rate(), dtype=torch.float64, device="cpu")
 
+    def hold(self, step: int) -> None:
+        """Keep the rate of a step from now on, such as the last of a training that is continued.
+
+        Raises a ValueError if the schedule leaves its range there.
+        """
+        self._schedule, self._rate = Constant(self._present_rate(step)), None
+
     def _present_rate(self, step: int | None = None) -> float:
         """Return the rate at a step, by default the current one, after a check."""
         step = self.step if step is None else step

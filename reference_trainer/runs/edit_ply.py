@@ -181,14 +181,19 @@ def clean_ply(
 def refined(model: TrainedModel, scene: Scene, steps: int, device: str = "cpu") -> TrainedModel:
     """Return a model after some more training steps on a scene, at the final learning rate of the means.
 
-    No Gaussian is added or removed. Errors are those of `Trainer`.
+    No Gaussian is added or removed. Regularizers go on from the last step of the training, and keep its rates. Errors
+    are those of `Trainer`.
     """
     usual, start = TrainConfig(), model.gaussians
+    first = model.step if model.regularizer else 0
     config = replace(
-        usual, iterations=steps, regularizer=model.regularizer, sh_degree=start.sh_degree,
+        usual, iterations=first + steps, regularizer=model.regularizer, sh_degree=start.sh_degree,
         means_rate=usual.means_rate_final, densify_every=0, opacity_reset_every=0,
     )  # fmt: skip
     trainer = Trainer(replace(scene, start=start), config, device)
+    trainer.step = first
+    for member in trainer.regularizer:
+        member.hold(max(first - 1, 0))  # as in `TrainedModel.params`
     with threads_for(scene.pixels):
         trainer.train()
     return replace(model, gaussians=trainer.gaussians.map(Tensor.detach))

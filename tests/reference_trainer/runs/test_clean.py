@@ -7,7 +7,7 @@ from reference_trainer.evaluation.shares import blend_weights, guard, mean_share
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
 from reference_trainer.runs import edit_ply
-from reference_trainer.runs.edit_ply import clean_ply
+from reference_trainer.runs.edit_ply import clean_ply, refined
 from reference_trainer.runs.folder import BAKED_PLY, PLY
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.options import OrbitOptions
@@ -41,6 +41,27 @@ def test_refining_closes_the_holes(run, options, tmp_path):
     holes, closed = found["taken out"], found["after 20 steps"]
     assert closed.gaussians == holes.gaussians == len(load_ply(tmp_path / "c.ply").gaussians)
     assert closed.mean("train", "psnr") > holes.mean("train", "psnr")
+
+
+@pytest.mark.parametrize(
+    ("scheduled", "at_the_end"),
+    [
+        ("dropout(ramp(0.0, 0.5, 0, 7_000))", "dropout(0.5)"),
+        ("dropout(between(0.5, 10, 7_000))", "dropout(0.5)"),  # it ends with the training
+        ("drop_sh(0.5)", "drop_sh(0.0)"),  # which stops at step 6,000
+    ],
+)
+def test_refining_regularizes_as_the_training_ended(scheduled, at_the_end, run):
+    """It began anew: a rate that rises was 0, and one that ends with the training what it had been at first."""
+    model, scene = load_run_model(run[0])
+    bands = torch.rand(len(model.gaussians), 15, 3, generator=torch.Generator().manual_seed(0))
+    model = dataclasses.replace(model, step=7_000, gaussians=dataclasses.replace(model.gaussians, sh_rest=bands))
+    found, expected = (
+        refined(dataclasses.replace(model, regularizer=text), scene, 3) for text in (scheduled, at_the_end)
+    )
+    for name, x in found.gaussians.named():
+        assert torch.equal(x, dict(expected.gaussians.named())[name]), name
+    assert not torch.equal(found.gaussians.means, model.gaussians.means)
 
 
 def test_without_a_scene_a_model_is_cleaned_as_large_as_it_was(run, tmp_path, said):
