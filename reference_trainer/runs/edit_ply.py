@@ -124,7 +124,8 @@ def clean_ply(
     in (0, 1), of all Gaussians is removed; those without a share stay. The removal leaves holes, which ``refine``
     training steps on the photographs close, without densification and with the regularizers of the model: by default
     100, or none with ``hanging``, which leaves no holes, or without a scene. Logs a table of quality and co-adaptation
-    before and after, and says so if the photographs are fitted worse, or the model is none of the scene. Returns the evaluations by row of the table.
+    before and after, and says so if the photographs are fitted worse, or the model is none of the scene. Returns the
+    evaluations by row of the table.
 
     ``where`` is the model's scene, or an orbit around it; opacities are written plain. ``anyway`` cleans a model that
     was trained with dropout, too, which made all measured ones worse. The rest is as in `score_ply`.
