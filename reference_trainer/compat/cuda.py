@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, Self
 from unittest.mock import patch
 
 import torch
@@ -31,8 +31,9 @@ def cuda_on_cpu() -> Iterator[None]:
     With a CUDA device nothing is changed. Without one, ``device="cuda"`` in any torch function, ``.to("cuda")`` and
     ``.cuda()`` of tensors and modules, ``.pin_memory()``, ``torch.load`` by default or with ``map_location="cuda"``,
     and ``torch.Generator("cuda")`` mean the CPU. In ``torch.cuda``, ``Event``, ``Stream``, ``stream``, ``synchronize``,
-    ``set_device``, ``current_device``, ``current_stream``, ``reset_peak_memory_stats`` and ``nvtx`` run without effect,
-    and ``mem_get_info``, ``get_device_properties`` and ``get_device_name`` report a device with `MEMORY` bytes.
+    ``set_device``, ``current_device``, ``current_stream``, ``device``, ``device_of``, ``reset_peak_memory_stats`` and
+    ``nvtx`` run without effect, and ``mem_get_info``, ``get_device_properties``, ``get_device_name`` and
+    ``get_device_capability`` report a device with `MEMORY` bytes.
     A torchvision built for CUDA can be imported, without its own kernels.
     Everything is restored at the end. ``torch.cuda.is_available()`` stays False.
 
@@ -156,17 +157,35 @@ class _Event:
     synchronize = wait
 
 
-class _Stream:
-    """A stream of work; a CPU has only one."""
+class _Context:
+    """A context without effect."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         pass
 
-    def __enter__(self) -> _Stream:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
         pass
+
+
+class _Device(_Context):
+    """The current device; there is only one."""
+
+
+class _DeviceOf(_Context):
+    """The device of a tensor."""
+
+
+class _Stream(_Context):
+    """A stream of work; a CPU has only one."""
+
+    def record_event(self, event: _Event | None = None) -> _Event:
+        """Mark now."""
+        event = event or _Event()
+        event.record(self)
+        return event
 
     def _wait(self, *args: Any) -> None:
         """Wait for nothing."""
@@ -184,6 +203,9 @@ _STAND_INS: dict[str, Any] = {
     "Stream": _Stream,
     "current_device": lambda: 0,
     "current_stream": lambda device=None: _Stream(),
+    "device": _Device,
+    "device_of": _DeviceOf,
+    "get_device_capability": lambda device=None: (0, 0),
     "get_device_name": lambda device=None: "CPU",
     "get_device_properties": lambda device=None: SimpleNamespace(
         name="CPU",

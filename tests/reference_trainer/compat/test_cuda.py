@@ -1,17 +1,21 @@
 """Code that says "cuda", on a machine without."""
 
 import importlib
+import re
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 import torch
+from floors import sources
 from torch._inductor.codecache import CacheBase
 
 from reference_trainer.compat.cuda import cuda_on_cpu
 
 without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="with a CUDA device nothing is mapped")
 CUDA = torch.device("cuda:0")
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @without_cuda
@@ -88,6 +92,35 @@ def test_housekeeping_is_harmless():
         assert torch.cuda.memory_allocated() == 0
         assert torch.zeros(1, device=torch.device("cuda", torch.cuda.current_device())).device.type == "cpu"
         assert not torch.cuda.is_available()
+
+
+ANSWERS = {
+    "Event": lambda: torch.cuda.Event().record(torch.cuda.current_stream()),
+    "current_device": lambda: torch.ones(2, device=torch.cuda.current_device()),
+    "current_stream": lambda: torch.cuda.current_stream(CUDA).record_event().synchronize(),
+    "device_count": lambda: torch.cuda.device_count(),
+    "device_of": lambda: torch.cuda.device_of(torch.ones(2, device="cuda")).__enter__(),
+    "get_device_capability": lambda: torch.cuda.get_device_capability("cuda") >= (7, 5),
+    "get_device_name": lambda: torch.cuda.get_device_name("cuda"),
+    "get_device_properties": lambda: torch.cuda.get_device_properties("cuda").total_memory,
+    "is_available": lambda: torch.cuda.is_available(),
+    "is_current_stream_capturing": lambda: torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing(),
+    "is_initialized": lambda: torch.cuda.is_initialized(),
+    "synchronize": lambda: torch.cuda.synchronize("cuda"),
+}
+"""How the packages use what they use of `torch.cuda`."""
+
+
+@without_cuda
+def test_all_that_the_packages_ask_of_a_card_has_an_answer():
+    asked = re.compile(r"\btorch\.cuda\.(\w+)")
+    texts = [path.read_text("utf-8") for path in sources(ROOT).values()]
+    assert {name for text in texts for name in asked.findall(text)} == ANSWERS.keys()
+    with cuda_on_cpu():
+        for answer in ANSWERS.values():
+            answer()
+        with torch.cuda.device(0):
+            assert torch.ones(2, device="cuda").sum() == 2
 
 
 @without_cuda
