@@ -16,13 +16,15 @@ from ca_reg.regularizers import parse
 from reference_trainer.evaluation.evaluate import Evaluation
 from reference_trainer.evaluation.lpips import LPIPS
 from reference_trainer.evaluation.metrics import counted, psnr
+from reference_trainer.evaluation.pictures import file_names, is_own_png
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
-from reference_trainer.runs.folder import check_trusted
+from reference_trainer.runs.folder import VIEWS, check_trusted
 from reference_trainer.runs.measure import log_what_hangs, measure
 from reference_trainer.scenes import load_scene
+from reference_trainer.scenes.images import image_size
 from reference_trainer.scenes.options import BACKGROUNDS, OrbitOptions, SceneOptions
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 from reference_trainer.scenes.virtual_cameras import bounding_sphere, measured_views, orbit_views
@@ -154,7 +156,7 @@ def load_for_views(
     if isinstance(where, OrbitOptions):
         return _on_orbit(model, where, about)
     assert scene is not None
-    for doubt in check_frame(model.gaussians, scene, ply):
+    for doubt in [*check_frame(model.gaussians, scene, ply), *_other_size(ply, scene)]:
         _log.info(doubt)
     return ModelWithViews(model, 1.0, measured_views(scene), scene, about | {"scene": scene.name})
 
@@ -243,6 +245,21 @@ def log_other_frame(result: Evaluation, scene: Scene, ply: Path) -> None:
             f"Every training view is further from its photograph than a picture of one color would be: {ply} is not "
             f"in the frame of {scene.name}, or not a model of it. The PSNR says nothing, CA is that of these views."
         )
+
+
+def _other_size(ply: Path, scene: Scene) -> list[str]:
+    """Return a note if the run that a PLY lies in drew its training views larger or smaller than those of the scene."""
+    for view, name in zip(scene.train, file_names([view.name for view in scene.train]), strict=True):
+        picture = ply.parent / VIEWS / "train" / f"{name}.png"
+        if picture.is_file() and is_own_png(picture):
+            (width, height), camera = image_size(picture), view.camera
+            if (width, height) == (camera.width, camera.height):
+                return []
+            return [
+                f"{ply} was trained at {width}x{height}, the size of its pictures in {picture.parent}, and is measured "
+                f"at {camera.width}x{camera.height}: its own scores are no comparison. --downscale gives its size."
+            ]
+    return []
 
 
 NEARLY_NONE = 0.01

@@ -14,7 +14,7 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import BAKED_PLY, PLY
 from reference_trainer.runs.measure import load_run_model
-from reference_trainer.runs.ply import load_ply_model, score_ply
+from reference_trainer.runs.ply import load_for_views, load_ply_model, score_ply
 from reference_trainer.runs.run import save_for_viewers
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import OrbitOptions
@@ -237,6 +237,14 @@ def test_a_ply_on_its_scene(run, options, tmp_path, said):
     assert found["ply"]["regularizer"] == "dropout(0.2)"
     assert f"Scores and pictures are in {tmp_path}" in said
     assert "where nobody took a photograph" in said[-1]
+
+
+@pytest.mark.parametrize(("downscale", "noted"), [(8.0, False), (5.0, True)])
+def test_another_size_than_that_of_the_training_is_noted(downscale, noted, run, options, said):
+    """A run of `ca-reg run --quick` is made of a tenth of a megapixel, and its photographs are larger."""
+    load_for_views(run[0] / PLY, dataclasses.replace(options, downscale=downscale))
+    assert any("trained at 20x15, the size of its pictures in " in text for text in said) == noted
+    assert any("is measured at 32x24" in text for text in said) == noted
 
 
 @pytest.mark.slow
