@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from benchmarks import starts
-from benchmarks.setting import REFERENCES
+from benchmarks.setting import LATER, REFERENCES, rows_of
+from reference_trainer.training.plan_rules import DENSE_GAINS
 
 
 def row(scene, candidate, psnr, held_out=None, seed=0):
@@ -54,6 +57,16 @@ def test_cameras_of_three_photographs_alone():
         "21.00",
         "+2.00",
     ]
+
+
+def test_what_the_plan_says_of_a_dense_start_is_what_was_measured():
+    rows = json.loads((REFERENCES.parent / "setting.json").read_text("utf-8"))
+    for scene, gain in DENSE_GAINS.items():
+        without, there = (
+            rows_of(rows, f"{scene}{start}", LATER)[0]["test"]["psnr"]
+            for start in ("" if scene in ("fountain", "herz-jesu") else ", SIFT", ", dense and SIFT")
+        )
+        assert gain == pytest.approx(there - without, abs=0.051)
 
 
 def test_the_page_has_the_tables_of_its_rows():

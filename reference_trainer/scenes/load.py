@@ -14,7 +14,7 @@ from torch import Tensor
 
 from reference_trainer.json_files import read_json
 from reference_trainer.scenes.colmap import COLMAP
-from reference_trainer.scenes.dense import MOST, dense_start
+from reference_trainer.scenes.dense import ENOUGH, MOST, dense_start
 from reference_trainer.scenes.depth import point_prior, true_priors, with_prior
 from reference_trainer.scenes.formats import Capture, find_reader, only_default, register_format
 from reference_trainer.scenes.frames import Frame, corner_displacement, load_view
@@ -118,17 +118,17 @@ def _enough_points(
     cloud: PointCloud, about: str, views: Sequence[View], train: Sequence[Frame], generator: torch.Generator
 ) -> tuple[PointCloud, str]:
     """Add to measured points, if they are few, those of a dense start, or random ones where that cannot be."""
-    if len(cloud.positions) >= THIN:
-        return cloud, about
-    if len(views) > MOST:
+    number, fault = len(cloud.positions), ""
+    if number < ENOUGH and len(views) <= MOST:
+        try:
+            cloud, found = dense_start(views, cloud)
+            return cloud, found if number else "; ".join(filter(None, (found, about)))
+        except (ImportError, ValueError) as error:
+            fault = str(error)
+    if number < THIN:
         cloud, more = filled(cloud, train, generator)
-        return cloud, "; ".join(filter(None, (about, more)))
-    try:
-        dense, more = dense_start(views, cloud)
-    except (ImportError, ValueError) as error:
-        cloud, more = filled(cloud, train, generator)
-        return cloud, "; ".join(filter(None, (about, more, str(error))))
-    return dense, more if len(cloud.positions) else "; ".join(filter(None, (more, about)))
+        about = "; ".join(filter(None, (about, more)))
+    return cloud, "; ".join(filter(None, (about, fault)))
 
 
 def _built_in(options: SceneOptions, seed: int) -> Scene:

@@ -48,8 +48,9 @@ class SceneOptions:
     points: str = "auto"
     """Initial points: a COLMAP folder such as sparse_3views/0, a .ply file (points or 3DGS) within the scene, "random"
     or "random:COUNT", or "dense" for points measured on the training photographs by stereo, in half a minute; by
-    default the largest cloud made from training views alone. If it has fewer than 1,000 points, or there is none, up to
-    ten training photographs get a dense start besides; random points where that finds nothing."""
+    default the largest cloud made from training views alone. If it has fewer than 10,000 points, or there is none, up
+    to ten training photographs get a dense start besides; where that fails, a cloud of fewer than 1,000 random points.
+    """
     init: str | None = None
     """A 3DGS .ply, anywhere: training starts from all parameters of its Gaussians, in place of points."""
     depth: str | None = None
