@@ -54,7 +54,7 @@ _WRITTEN: dict[Step, tuple[str, ...]] = {
 }
 """What each step writes. `--from` deletes that of a step and of those after it."""
 
-_TRAINING, _SHOWN, _MATCHED, _REFERENCE = 1.9, 30.0, 115.0, 2.9e-7
+_TRAINING, _SHOWN, _MATCHED, _REFERENCE = 2.0, 30.0, 115.0, 2.9e-7
 """Of `_forecast`: a training step, measuring and showing a view, and a photograph of the dense start if it is matched
 at the size of the training, all in timed steps; seconds of such a step per pixel on the machine on which the seconds of
 the poses were measured."""
