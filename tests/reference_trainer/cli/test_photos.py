@@ -85,7 +85,7 @@ def test_three_photographs_become_a_page(garden, tmp_path, capsys, monkeypatch):
     assert opened == [(out / "report.html").as_uri()]
     assert "garden" in re.search("<title>(.*)</title>", page)[1]
     verdict = re.search(r'"verdict": "([^"]*)"', page)[1]
-    assert "CA" in verdict
+    assert "around the training views" in verdict
     assert "test view" not in verdict
     settings = json.loads((out / "config.json").read_text())["config"]
     assert (settings["dropout"], settings["opacity_decay"], settings["iterations"]) == (0.2, 0.995, 3)
@@ -266,7 +266,7 @@ def test_three_real_photographs_from_nothing_to_the_page(data_root, tmp_path, ca
     main(["run", str(tmp_path / "fern"), "--out", str(tmp_path / "out"), "--quick", "--no-open"])
     said = capsys.readouterr().out
     assert "3 of 3 photographs registered" in said
-    assert re.search(r"will take about \d+ (s|min) on this machine as it is now: poses \d+ s, training \d+ s", said)
+    assert re.search(r"will take about \d+ (s|min) on this machine as it is now: poses \d+ s, points \d+ s, training \d+ s", said)
     assert (tmp_path / "out/report.html").stat().st_size > 1e5  # with pictures and model
     results = json.loads((tmp_path / "out/results.json").read_text())
     assert set(results["mean"]) == {"train", "between", "around"}
