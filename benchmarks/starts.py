@@ -19,7 +19,7 @@ from benchmarks.paper.rows import value
 from benchmarks.paper.scenes import SCENES
 from benchmarks.setting import CHOSEN, FEW_AND_RANDOM, LATER, Row, rows_of
 from benchmarks.start_scenes import SIFT
-from reference_trainer.evaluation.tables import format_mean_std, markdown_table
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = ["choice", "judgement", "own_cameras", "tables"]
 
@@ -48,21 +48,25 @@ def choice(rows: Sequence[Row], starts: Sequence[str], seed: int = 0) -> str:
 
 def judgement(rows: Sequence[Row], start: str) -> str:
     """Return the table of the chosen start against the one before, test views, with the seeds that both have."""
-    lines, every = [], list[float]()
+    lines, every, spreads = [], list[float](), list[float]()
     for scene in SCENES:
         before, after = _rows(rows, scene, FEW_AND_RANDOM, CHOSEN), _rows(rows, scene, start, LATER)
         if shared := sorted(before.keys() & after.keys()):
             pairs = [[value(of[seed], "test psnr") for seed in shared] for of in (before, after)]
             gains = [b - a for a, b in zip(*pairs, strict=True)]
             every.append(fmean(gains))
+            if len(after) > 1:
+                spreads.append(mean_std(value(row, "test psnr") for row in after.values())[1])
             lines.append({
                 "scene": scene, "seeds": str(len(shared)), "before": format_mean_std(pairs[0], decimals=2),
                 "now": format_mean_std(pairs[1], decimals=2), "gain, by seed": ", ".join(f"{x:+.2f}" for x in gains),
             })  # fmt: skip
     if not lines:
         return f"Nothing of {start!r} was judged."
-    total = f"- mean gain over {len(every)} scenes: {fmean(every):+.1f} dB; the least: {min(every):+.1f} dB"
-    return "\n".join([markdown_table(lines, [*lines[0]]), "", total])
+    total = [f"- mean gain over {len(every)} scenes: {fmean(every):+.1f} dB; the least: {min(every):+.1f} dB"]
+    if spreads:
+        total.append(f"- standard deviation of seeds now, mean over {len(spreads)} scenes: {fmean(spreads):.2f} dB")
+    return "\n".join([markdown_table(lines, [*lines[0]]), "", *total])
 
 
 def own_cameras(rows: Sequence[Row]) -> str:

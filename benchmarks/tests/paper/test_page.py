@@ -18,7 +18,7 @@ from benchmarks.paper.figure import gains_figure, ranking_figure
 from benchmarks.paper.page import claims_table, details, gains, page, scenes_table
 from benchmarks.paper.rows import Rows, resolved, value
 from benchmarks.paper.scenes import chosen_scenes
-from benchmarks.setting import differences as differences_to_plain
+from benchmarks.setting import recommended
 from reference_trainer.evaluation.style import new_figure
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.plan_rules import DROPOUT_GAINS, FAR_APART_GAINS, SPARSE_GAINS, SPARSE_GAINS_FAR_APART
@@ -262,7 +262,7 @@ def test_no_scene_is_left_out_of_what_is_said_of_dropout():
 def test_what_the_recommended_setting_gained_is_what_was_measured():
     """The figures of the rule against the kept rows, the worst pair of each scene among them."""
     data = ROOT / "benchmarks" / "data"
-    found = differences_to_plain(json.loads((data / "setting.json").read_text("utf-8")))
+    found = recommended(json.loads((data / "setting.json").read_text("utf-8")))
     said = {FOLDERS.get(name, name): ends for name, ends in (SPARSE_GAINS | SPARSE_GAINS_FAR_APART).items()}
     assert said == {scene: pytest.approx((min(pairs), max(pairs)), abs=0.051) for scene, pairs in found.items()}
     every = [gain for pairs in found.values() for gain in pairs]

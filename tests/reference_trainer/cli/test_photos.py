@@ -266,7 +266,9 @@ def test_three_real_photographs_from_nothing_to_the_page(data_root, tmp_path, ca
     main(["run", str(tmp_path / "fern"), "--out", str(tmp_path / "out"), "--quick", "--no-open"])
     said = capsys.readouterr().out
     assert "3 of 3 photographs registered" in said
-    assert re.search(r"will take about \d+ (s|min) on this machine as it is now: poses \d+ s, points \d+ s, training \d+ s", said)
+    assert re.search(
+        r"will take about \d+ (s|min) on this machine as it is now: poses \d+ s, points \d+ s, training \d+ s", said
+    )
     assert (tmp_path / "out/report.html").stat().st_size > 1e5  # with pictures and model
     results = json.loads((tmp_path / "out/results.json").read_text())
     assert set(results["mean"]) == {"train", "between", "around"}
