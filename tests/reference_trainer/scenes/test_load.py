@@ -266,7 +266,7 @@ def test_fern(data_root):
 )
 def test_splits_find_their_own_points(data_root, scene, split, train, points):
     images = "images_2" if (data_root / scene / "images_2").is_dir() else None
-    loaded = load_scene(SceneOptions(data_root / scene, images=images, split=split))
+    loaded = load_scene(SceneOptions(data_root / scene, images=images, split=split), trains=False)
     assert [view.name for view in loaded.train] == train
     assert loaded.points.source.endswith(points)
 
