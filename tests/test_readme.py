@@ -39,8 +39,8 @@ COMMANDS = [
 QUICK = {
     "run": ["--quick", "--no-open"],
     "train": ["--iterations", "4", "--images", "images"],
-    # a process for each run
-    "compare": ["--iterations", "2", "--images", "images", "--seeds", "1", "--strategies", "baseline", "dropout"],
+    # A process for each run, with as many steps as it takes until the score covers the pictures.
+    "compare": ["--iterations", "60", "--images", "images", "--seeds", "1", "--strategies", "baseline", "dropout"],
 }
 
 
