@@ -41,6 +41,7 @@ __all__ = [
     "binocular",
     "candidate",
     "choosing",
+    "controls",
     "differences",
     "failures",
     "judging",
@@ -135,7 +136,16 @@ def main(
 def tables(rows: Sequence[Row]) -> list[str]:
     """Return all tables of the page."""
     judged = [judging(rows), judging(rows, chosen=LATER)]
-    return [choosing(rows), second(rows), second(rows, (0, 1)), *judged, binocular(rows), starts(rows), failures(rows)]
+    return [
+        choosing(rows),
+        second(rows),
+        second(rows, (0, 1)),
+        *judged,
+        binocular(rows),
+        controls(rows),
+        starts(rows),
+        failures(rows),
+    ]
 
 
 def candidate(config: TrainConfig) -> str:
@@ -145,17 +155,18 @@ def candidate(config: TrainConfig) -> str:
         >>> candidate(TrainConfig(dropout=0.2, analytic=True, opacity_decay=0.998))
         'expectation, decay 0.998'
     """
+    begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
     if config.analytic:
         return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
     if config.opacity_decay < 1 and config.guard:
-        begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
         config = dataclasses.replace(config, densify_from=begins)
         values = {name: (getattr(config, field), value) for name, (field, value) in _SECOND.items()}
         changes = [name for name, (x, value) in values.items() if (value in x if isinstance(x, str) else x == value)]
         return " + ".join(changes) or CHOSEN
     if "warp" in config.loss:
         return "Binocular3DGS" + (", dropout" if config.dropout else "")
-    return "dropout" if config.dropout else "noise" if config.noise else "plain"
+    name = "dropout" if config.dropout else "noise" if config.noise else "plain"
+    return name + (f", {LATER}" if begins == 1_000 else "")
 
 
 def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
@@ -165,7 +176,7 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
     results = read_json(run / "results.json")
     name = Path(options.path).name
     row: Row = {"scene": _scene(options), "candidate": candidate(config), "seed": config.seed}
-    if name in HELD_OUT and row["candidate"] not in _REFERENCES:
+    if name in HELD_OUT and row["candidate"].removesuffix(f", {LATER}") not in _REFERENCES:
         others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(name, ())]
         row["held-out"] = fmean(quality(model, view) for view in others)
     test, metric = results["mean"]["test"], results.get("perceptual_metric")
@@ -334,6 +345,25 @@ def starts(rows: Sequence[Row]) -> str:
                     "difference": f"{after[0] - before[0]:+.2f} / {after[1] - before[1]:+.2f}",
                 })  # fmt: skip
     return markdown_table(lines, ["points", "scene", CHOSEN, LATER, "difference"])
+
+
+def controls(rows: Sequence[Row], references: Path = REFERENCES) -> str:
+    """Return the table of the later beginning without dropout, and without decay and guard: test PSNR, seed 0."""
+    lines = []
+    for scene in SCENES:
+        kept = _references(rows, references, scene)
+        every = {name: kept[name] for name in ("plain", "dropout")} | {CHOSEN: rows_of(rows, scene, CHOSEN)}
+        later = {name: rows_of(rows, scene, f"{name}, {LATER}") for name in ("plain", "dropout")}
+        later[CHOSEN] = rows_of(rows, scene, LATER)
+        pairs = {name: (of.get(0), later[name].get(0)) for name, of in every.items()}
+        if all(before and after for before, after in pairs.values()):
+            line = {"scene": scene}
+            for name, pair in pairs.items():
+                before, after = (value(row, "test psnr") for row in pair if row)
+                line[name] = f"{before:.2f}"
+                line[f"{name}, {LATER}"] = f"{after:.2f} ({after - before:+.2f})"
+            lines.append(line)
+    return markdown_table(lines, [*lines[0]]) if lines else "No control was trained."
 
 
 def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:

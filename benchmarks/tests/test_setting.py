@@ -66,6 +66,19 @@ def test_other_points_stand_apart():
     assert "18.00" not in setting.choosing(rows)
 
 
+def test_a_control_is_what_the_later_beginning_gains_alone(tmp_path):
+    figures = {"plain": 20.0, "dropout": 21.0, "drawn": 22.0}
+    rows = [row("fern", name, 0, psnr) for name, psnr in figures.items()]
+    rows += [row("fern", f"{name}, from 1,000", 0, figures[name] + 0.5) for name in ("plain", "dropout")]
+    assert setting.controls(rows, tmp_path) == "No control was trained."
+    (line,) = [
+        x for x in setting.controls([*rows, row("fern", "from 1,000", 0, 23.0)], tmp_path).splitlines() if "fern" in x
+    ]
+    assert [x.strip() for x in line.split("|")[2:-1]] == [
+        "20.00", "20.50 (+0.50)", "21.00", "21.50 (+0.50)", "22.00", "23.00 (+1.00)",
+    ]  # fmt: skip
+
+
 def test_a_failure_is_a_decibel_below_the_median_of_its_own_seeds(tmp_path):
     figures = {"plain": (20.0, 20.5, 19.4, 20.1, 20.2), "drawn": (21.0, 19.9, 21.2, 21.1, 19.0)}
     rows = [row("fountain", name, seed, psnr) for name, of in figures.items() for seed, psnr in enumerate(of)]
@@ -93,6 +106,8 @@ def test_the_recipe_is_what_was_chosen():
     assert setting.candidate(with_recipe("sparse", iterations=3_000)) == setting.LATER
     assert setting.candidate(with_recipe("sparse", iterations=2_000)) == setting.LATER
     assert setting.candidate(with_recipe("sparse", iterations=2_000, densify_from=100)) == setting.CHOSEN
+    assert setting.candidate(with_recipe("3dgs", iterations=3_000)) == "plain"
+    assert setting.candidate(with_recipe("3dgs", iterations=3_000, densify_from=1_000)) == "plain, from 1,000"
 
 
 def test_a_candidate_of_the_second_choice_gains_over_the_mean_of_the_seeds():
