@@ -43,8 +43,8 @@ SCENES = {
     "synthetic": SceneOptions(),
     "fern": SceneOptions("fern", images="images_16", points="sparse_3views_dense/0"),
     "lego": SceneOptions("lego", downscale=2.0, points="random"),
-    "herz-jesu": SceneOptions("herz-jesu", images="images_2", split="split_near"),
-    "fountain": SceneOptions("fountain", images="images_2", split="split_near"),
+    "herz-jesu": SceneOptions("herz-jesu", images="images_2", split="split_near", points="sparse_3near/0"),
+    "fountain": SceneOptions("fountain", images="images_2", split="split_near", points="sparse_3near/0"),
     "dtu-scan65": SceneOptions("dtu-scan65", points="sparse_3views_dense/0"),
     "dtu-scan24": SceneOptions("dtu-scan24", points="sparse_3views_dense/0"),
 }
