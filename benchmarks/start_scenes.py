@@ -51,8 +51,7 @@ def with_points(data: Path, out: Path, name: str) -> None:
         if not (folder / path.name).exists():
             (folder / path.name).symlink_to(path)
     sift = colmap_points(data / name / SIFT[name]) if name in SIFT else None
-    options = replace(SCENES[name].options, path=str(data / name), points=SIFT.get(name, "random"))
-    train = load_scene(options).train
+    train = load_scene(replace(SCENES[name].options, path=str(data / name)), trains=False).train
     generator = torch.Generator().manual_seed(0)
     few = PointCloud(torch.empty(0, 3), torch.empty(0, 3), "none", frozenset())
     if sift is not None:
@@ -96,7 +95,7 @@ def with_own_cameras(data: Path, out: Path, name: str) -> None:
 
     options = SCENES[name].options
     images = data / name / ("images_8" if name == "fern" else "images")  # of fern those of the README
-    scene = load_scene(replace(options, path=str(data / name), points="random", images=images.name))
+    scene = load_scene(replace(options, path=str(data / name), images=images.name), trains=False)
     trained = [Path(view.name).name for view in scene.train]
     folder, three = out / f"{name}-own", out / f"{name}-own" / "three"
     (three / "images").mkdir(parents=True)

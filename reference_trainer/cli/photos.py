@@ -202,7 +202,8 @@ class Run:
         """Return how long what is still to be done will take, from a few training steps on this machine.
 
         A real training step takes `_TRAINING` times as long as a timed one in the mean, because Gaussians grow in
-        number; all else is counted in timed steps too, so that it scales with the machine.
+        number; all else is counted in timed steps too, so that it scales with the machine. On a card, what the
+        processor does is taken to last as on the machine of `_REFERENCE`.
         """
         from reference_trainer.runs.warmup import step_seconds
         from reference_trainer.scenes.colmap import colmap_folders

@@ -242,7 +242,7 @@ def dense_start(scene: Scene, config: TrainConfig) -> PlanItem:
     if scene.start is not None:
         return PlanItem(name, "left out", "by construction: training starts from a model")
     if scene.points.source == SOURCE:
-        return PlanItem(name, "used", f"{number} points, measured on the training photographs and by others")
+        return PlanItem(name, "used", f"{number} points, those measured on the training photographs among them")
     if scene.points.source != "random" and number >= ENOUGH:
         return PlanItem(name, "left out", f"{number} measured points are enough")
     cameras, matched = [view.camera for view in scene.train], 0

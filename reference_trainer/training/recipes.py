@@ -138,7 +138,7 @@ RECIPES: dict[str, Recipe] = {
             dropout=0.2,
             opacity_decay=0.995,
         ),  # the schedule of 3dgs at 3,000 steps, but for the beginning of density control
-        "no publication: 3dgs, dropout (Chen et al. 2025), Binocular3DGS's opacity decay and the guard of this package",
+        "no publication: 3dgs densified later, dropout (Chen et al. 2025), Binocular3DGS's opacity decay, our guard",
         "nothing; benchmarks/setting.md says how it was chosen",
     ),
 }
