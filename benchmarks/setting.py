@@ -88,7 +88,7 @@ FEW_AND_RANDOM = "few measured points, random added"
 STARTS = {
     "random": "random points", "few_and_random.ply": FEW_AND_RANDOM, "dense.ply": "dense",
     "dense_and_few.ply": "dense and few", "dense_and_random.ply": "dense, few and random", "sift.ply": "SIFT",
-    "dense_and_sift.ply": "dense and SIFT",
+    "dense_and_sift.ply": "dense and SIFT", "dense_and_other.ply": "dense and other",
 }  # fmt: skip
 """Values of ``--points`` whose rows stand apart, and what they are called: files of `benchmarks.start_scenes`."""
 FAILING = ("herz-jesu", "fountain", "dtu-scan65", "sceaux")

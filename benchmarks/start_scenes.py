@@ -27,7 +27,7 @@ from reference_trainer.scenes.dense import dense_start
 from reference_trainer.scenes.load import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.points import colmap_points, filled, random_points_in_frusta
-from reference_trainer.scenes.poses import LARGEST_SIDE, find_poses
+from reference_trainer.scenes.poses import LARGEST_SIDE, enlarge, find_poses
 from reference_trainer.scenes.scene import PointCloud
 
 __all__ = ["SIFT", "with_own_cameras", "with_points"]
@@ -37,6 +37,8 @@ SIFT = {
     "sceaux": "sparse_3views/0", "cape": "sparse_3views/0",
 }  # fmt: skip
 """Points that COLMAP found in the training photographs; the other scenes are taken to have none."""
+OTHER = ("fern", "sceaux", "cape", "dtu-scan65", "dtu-scan24")
+"""Scenes whose declared points are the dense cloud of another program, of 10,000 to 15,000."""
 FEW = 450
 """So many it finds where it must find the cameras as well."""
 LEAST = 20
@@ -60,6 +62,9 @@ def with_points(data: Path, out: Path, name: str) -> None:
     both, _ = dense_start(train, few)
     number = len(both.positions) - len(few.positions)
     clouds = {"dense": replace(both, positions=both.positions[:number], colors=both.colors[:number])}
+    if name in OTHER:
+        other = load_scene(replace(SCENES[name].options, path=str(data / name)), trains=False).points
+        clouds["dense_and_other"] = dense_start(train, other)[0]
     if sift is not None:
         clouds |= {"few_and_random": filled(few, train, generator)[0], "dense_and_few": both}
         clouds |= {"sift": sift, "dense_and_sift": dense_start(train, sift)[0]}
@@ -134,11 +139,18 @@ def _placed(model: Any, images: Path) -> list[tuple[str, int, Any]]:
             pycolmap.import_images(
                 path, images, camera_mode=pycolmap.CameraMode.PER_IMAGE, image_names=[name], options=reader
             )
-        pycolmap.extract_features(path, images, image_names=[*known, *others], extraction_options=features)
+        larger = Path(work) / "photographs"
+        sizes = enlarge([images / name for name in (*known, *others)], path, larger)
+        pycolmap.extract_features(
+            path, larger if sizes else images, image_names=[*known, *others], extraction_options=features
+        )
         pycolmap.match_exhaustive(path)
         database = pycolmap.Database.open(path)
-        ids = {image.name: image.image_id for image in database.read_all_images()}
-        places = {name: database.read_keypoints(number)[:, :2] for name, number in ids.items()}
+        ids, places = {}, {}
+        for image in database.read_all_images():
+            width = database.read_camera(image.camera_id).width
+            by = sizes[image.camera_id][0] / width if image.camera_id in sizes else 1.0
+            ids[image.name], places[image.name] = image.image_id, by * database.read_keypoints(image.image_id)[:, :2]
         points: dict[str, dict[int, int]] = {}  # of every known photograph: the point that a feature belongs to
         for name, image in known.items():
             own = [(feature.xy, feature.point3D_id) for feature in image.points2D if feature.has_point3D()]

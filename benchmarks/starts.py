@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.paper.rows import value
 from benchmarks.paper.scenes import SCENES
 from benchmarks.setting import CHOSEN, FEW_AND_RANDOM, LATER, Row, rows_of
-from benchmarks.start_scenes import SIFT
+from benchmarks.start_scenes import OTHER, SIFT
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = ["choice", "judgement", "own_cameras", "tables"]
@@ -91,6 +91,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
     return [
         choice(rows, few),
         choice(rows, ["SIFT", "dense and SIFT"]),
+        choice(rows, ["other", "dense and other"]),
         judgement(rows, "dense and few"),
         own_cameras(rows),
     ]
@@ -104,8 +105,8 @@ def _rows(rows: Sequence[Row], scene: str, start: str, candidate: str) -> dict[i
     """Return the rows of a start by seed, which at some scenes has another name."""
     if scene not in SIFT:  # no measured point
         start = {FEW_AND_RANDOM: "random points", "dense and few": "dense"}.get(start, start)
-    declared = {"lego": "random points", "fountain": "SIFT", "herz-jesu": "SIFT"}.get(scene)
-    return rows_of(rows, scene if start == declared else f"{scene}, {start}", candidate)
+    declared = {"lego": "random points", "fountain": "SIFT", "herz-jesu": "SIFT"} | dict.fromkeys(OTHER, "other")
+    return rows_of(rows, scene if start == declared.get(scene) else f"{scene}, {start}", candidate)
 
 
 if __name__ == "__main__":

@@ -16,17 +16,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from reference_trainer.progress import progress_bar
 from reference_trainer.scenes._colmap_model import CAMERA_MODELS
 from reference_trainer.scenes.colmap import colmap_folders
 from reference_trainer.scenes.images import decode_image, image_size, list_images, unreadable_photographs
 
-__all__ = ["FoundPoses", "find_poses"]
+__all__ = ["FoundPoses", "enlarge", "feature_size", "find_poses"]
 
 FEW = 8
 """Below this many photographs COLMAP's settings, made for dozens, are replaced."""
 LARGEST_SIDE = 1600
 """Pixels of the longer side at which features are extracted: beyond, time grows and poses hardly improve."""
+ENLARGED = 2
+"""Smaller photographs are enlarged so many times at most, where they find several times as many features."""
+MANY = 30
+"""From so many photographs on they are not: the time of matching grows with the squares of both numbers."""
+CERTAIN = 0.5
+"""Pixels beyond which a feature counts as an outlier in the last bundle adjustment."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,12 @@ class FoundPoses:
         return "\n".join(lines)
 
 
+def feature_size(width: int, height: int, photographs: int) -> tuple[int, int]:
+    """Return the size at which features are extracted of one of so many photographs, pixels."""
+    by = min(LARGEST_SIDE / max(width, height), ENLARGED if photographs < MANY else 1)
+    return round(by * width), round(by * height)
+
+
 def find_poses(
     scene: str | Path,
     out: str | Path | None = None,
@@ -72,8 +86,8 @@ def find_poses(
     length are taken to share one camera. Those that are damaged or unknown to COLMAP are left out, and named. Below
     `FEW` photographs, where COLMAP's own settings find little, features use domain-size pooling and affine shapes,
     points need two photographs instead of three, and the focal lengths are kept if EXIF data give them for all
-    photographs, since so few determine them less well. The model is written atomically, and the result is
-    deterministic.
+    photographs, since so few determine them less well. Below `MANY`, small photographs are enlarged for their features.
+    A last bundle adjustment has a robust loss. The model is written atomically, and the result is deterministic.
 
     Args:
         scene: the scene folder.
@@ -164,7 +178,7 @@ def _reconstruct(
         import pycolmap
     except ImportError as error:
         raise ImportError("finding cameras needs pycolmap: pip install 'ca_reg[colmap]'.") from error
-    folder, database = photos[0].parent, work / "database.db"
+    folder, database, larger = photos[0].parent, work / "database.db", work / "photographs"
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.set_random_seed(seed)
     taken_with = {}
@@ -186,6 +200,8 @@ def _reconstruct(
         pycolmap.import_images(
             database, folder, camera_mode=pycolmap.CameraMode.SINGLE, image_names=names, options=reader
         )
+    sizes = enlarge(photos, database, larger)
+    folder = larger if sizes else folder
 
     extract = partial(
         pycolmap.extract_features, database, folder, image_names=[photo.name for photo in photos],
@@ -210,7 +226,68 @@ def _reconstruct(
         mapping.mapper.abs_pose_min_num_inliers = 15
         mapping.ba_refine_focal_length = mapping.mapper.abs_pose_refine_focal_length = not known
     models = pycolmap.incremental_mapping(database, folder, work, options=mapping).values()
-    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+    if not models:
+        return None
+    model = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    _adjust(model, mapping.ba_refine_focal_length)
+    _reduce(model, sizes)
+    return model
+
+
+def enlarge(photos: list[Path], database: Path, folder: Path) -> dict[int, tuple[int, int]]:
+    """Write what features are extracted from if some photographs are small: enlarged copies, and copies of the others.
+
+    Return the sizes that the cameras of enlarged photographs had in the database, by number.
+    """
+    import pycolmap
+    from PIL.Image import Resampling
+
+    sizes = {}
+    with closing(pycolmap.Database.open(database)) as opened:
+        for camera in opened.read_all_cameras():
+            size = camera.width, camera.height
+            larger = feature_size(*size, len(photos))
+            if larger > size:
+                sizes[camera.camera_id] = size
+                camera.rescale(*larger)
+                opened.update_camera(camera)
+        for photo in photos if sizes else ():
+            folder.mkdir(exist_ok=True)
+            camera = opened.read_camera(opened.read_image_with_name(photo.name).camera_id)
+            if camera.camera_id in sizes:
+                picture = decode_image(photo).convert("RGB")
+                picture = picture.resize((camera.width, camera.height), Resampling.LANCZOS)
+                picture.save(folder / photo.name, quality=100, subsampling=0)
+            else:
+                shutil.copy(photo, folder)
+    return sizes
+
+
+def _adjust(model: Any, refine_focal_length: bool) -> None:
+    """Adjust cameras and points once more, with a robust loss: COLMAP's own squares the errors of all features."""
+    import pycolmap
+
+    options = pycolmap.BundleAdjustmentOptions(refine_focal_length=refine_focal_length, print_summary=False)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = CERTAIN
+    options.ceres.solver_options.num_threads = 1
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in model.reg_image_ids():
+        config.add_image(image)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+def _reduce(model: Any, sizes: Mapping[int, tuple[int, int]]) -> None:
+    """Give enlarged cameras, and the features of their photographs, their sizes back."""
+    for image in model.images.values():
+        if image.camera_id in sizes:
+            camera, size = model.cameras[image.camera_id], sizes[image.camera_id]
+            for feature in image.points2D:
+                feature.xy *= np.array(size) / (camera.width, camera.height)
+    for number in {*sizes} & {*model.cameras}:
+        model.cameras[number].rescale(*sizes[number])
+    model.update_point_3d_errors()
 
 
 def _watched(job: Callable[..., None], database: Path, table: str, total: int, **bar: Any) -> None:
