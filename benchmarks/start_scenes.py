@@ -38,7 +38,7 @@ SIFT = {
 }  # fmt: skip
 """Points that COLMAP found in the training photographs; the other scenes are taken to have none."""
 OTHER = ("fern", "sceaux", "cape", "dtu-scan65", "dtu-scan24")
-"""Scenes whose declared points are the dense cloud of another program, of 10,000 to 15,000."""
+"""Scenes whose declared points are the dense cloud of another program, of 8,000 to 15,000 points."""
 FEW = 450
 """So many it finds where it must find the cameras as well."""
 LEAST = 20

@@ -251,9 +251,10 @@ def enlarge(photos: list[Path], database: Path, folder: Path) -> dict[int, tuple
                 sizes[camera.camera_id] = size
                 camera.rescale(*larger)
                 opened.update_camera(camera)
+        taken_with = {image.name: opened.read_camera(image.camera_id) for image in opened.read_all_images()}
         for photo in photos if sizes else ():
             folder.mkdir(exist_ok=True)
-            camera = opened.read_camera(opened.read_image_with_name(photo.name).camera_id)
+            camera = taken_with[photo.name]
             if camera.camera_id in sizes:
                 picture = decode_image(photo).convert("RGB")
                 picture = picture.resize((camera.width, camera.height), Resampling.LANCZOS)
