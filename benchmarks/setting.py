@@ -64,13 +64,14 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "no reset": ("opacity_reset_every", 0),
     "rate 0.3": ("dropout", 0.3),
     "threshold 2e-4": ("densify_gradient", 2e-4),
+    "threshold 3e-4": ("densify_gradient", 3e-4),
     "degree 1": ("sh_degree", 1),
     "random background": ("random_background", True),
     "warp": ("loss", "warp("),
     "depth of the points": ("loss", "pearson("),
     "flat": ("loss", "flat("),
 }
-"""What a candidate of the second choice changes in the chosen setting: a field and its value, of a loss the term."""
+"""What a candidate of the later choices changes in the chosen setting: a field and its value, of a loss the term."""
 _FIGURES = "psnr", "ssim", "lpips", "ca_exact_half"
 CHOSEN = "drawn"
 """What the first choice chose, and the second started from: ``--recipe sparse --densify-from 150``."""
@@ -144,6 +145,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
         binocular(rows),
         controls(rows),
         starts(rows),
+        third(rows),
         failures(rows),
     ]
 
@@ -227,6 +229,26 @@ def second(rows: Sequence[Row], seeds: Sequence[int] = (0,)) -> str:
                 line[scene] = f"{gains[-1]:+.2f}"
         if gains:
             lines.append(line | {"mean": f"{fmean(gains):+.2f}", "scenes": str(len(gains))})
+    columns = ["candidate", *(s for s in HELD_OUT if any(s in line for line in lines)), "mean", "scenes"]
+    return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
+
+
+def third(rows: Sequence[Row]) -> str:
+    """Return the table of the third choice, from the dense start: gains at held-out / test views, and Gaussians."""
+    lines = []
+    for name in ("rate 0.3", "no reset", "threshold 3e-4"):
+        line, gains = {"candidate": name}, list[tuple[float, float]]()
+        for scene in HELD_OUT:
+            start = f"{scene}, {'dense' if scene.startswith('dtu') else 'dense and few'}"
+            before, after = (rows_of(rows, start, x).get(0) for x in (LATER, f"{LATER} + {name}"))
+            if before and after:
+                held_out = after["held-out"] - before["held-out"]
+                gains.append((held_out, value(after, "test psnr") - value(before, "test psnr")))
+                more = after["gaussians"] / before["gaussians"]
+                line[scene] = "{:+.2f} / {:+.2f}, {:.2f}".format(*gains[-1], more)
+        if gains:
+            means = map(fmean, zip(*gains, strict=True))
+            lines.append(line | {"mean": "{:+.2f} / {:+.2f}".format(*means), "scenes": str(len(gains))})
     columns = ["candidate", *(s for s in HELD_OUT if any(s in line for line in lines)), "mean", "scenes"]
     return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 

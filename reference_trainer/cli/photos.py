@@ -208,7 +208,7 @@ class Run:
         from reference_trainer.runs.warmup import step_seconds
         from reference_trainer.scenes.colmap import colmap_folders
         from reference_trainer.scenes.dense import MOST, matched_size
-        from reference_trainer.scenes.poses import feature_size
+        from reference_trainer.scenes.poses import FEW, feature_size
         from reference_trainer.training.checkpoint import load_checkpoint
 
         if (self.folder / RESULTS).exists():
@@ -227,8 +227,8 @@ class Run:
         if not done and (self.points == "dense" or (self.points == "auto" and count <= MOST)):
             times = {"points": core * _MATCHED * count * math.prod(matched_size(*size)) / pixels, **times}
         if scene != self.photos and not colmap_folders(scene):
-            megapixels = math.prod(feature_size(width, height, count)) / 1e6
-            work = count * megapixels * (10.0 if count < 8 else 2.0) + 0.025 * count * (count - 1) / 2
+            megapixels = math.prod(feature_size(width, height, few=count < FEW)) / 1e6
+            work = count * megapixels * (10.0 if count < FEW else 2.0) + 0.025 * count * (count - 1) / 2
             times = {"poses": core / (_REFERENCE * pixels) * work, **times}
         parts = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in times.items())
         return f"This will take about {_duration(sum(times.values()))} on this machine as it is now: {parts}."

@@ -23,16 +23,14 @@ from reference_trainer.scenes._colmap_model import CAMERA_MODELS
 from reference_trainer.scenes.colmap import colmap_folders
 from reference_trainer.scenes.images import decode_image, image_size, list_images, unreadable_photographs
 
-__all__ = ["FoundPoses", "enlarge", "feature_size", "find_poses"]
+__all__ = ["FEW", "FoundPoses", "enlarge", "feature_size", "find_poses"]
 
 FEW = 8
 """Below this many photographs COLMAP's settings, made for dozens, are replaced."""
 LARGEST_SIDE = 1600
 """Pixels of the longer side at which features are extracted: beyond, time grows and poses hardly improve."""
 ENLARGED = 2
-"""Smaller photographs are enlarged so many times at most, where they find several times as many features."""
-MANY = 30
-"""From so many photographs on they are not: the time of matching grows with the squares of both numbers."""
+"""Fewer than `FEW` photographs that are smaller are enlarged so many times at most: several times as many features."""
 CERTAIN = 0.5
 """Pixels beyond which a feature counts as an outlier in the last bundle adjustment."""
 
@@ -66,9 +64,9 @@ class FoundPoses:
         return "\n".join(lines)
 
 
-def feature_size(width: int, height: int, photographs: int) -> tuple[int, int]:
-    """Return the size at which features are extracted of one of so many photographs, pixels."""
-    by = min(LARGEST_SIDE / max(width, height), ENLARGED if photographs < MANY else 1)
+def feature_size(width: int, height: int, *, few: bool) -> tuple[int, int]:
+    """Return the size at which features of a photograph are extracted, pixels: one of fewer than `FEW`, or of more."""
+    by = min(LARGEST_SIDE / max(width, height), ENLARGED if few else 1)
     return round(by * width), round(by * height)
 
 
@@ -85,9 +83,9 @@ def find_poses(
     The photographs are those in ``images`` of the scene folder, or in the folder itself. Those of equal size and focal
     length are taken to share one camera. Those that are damaged or unknown to COLMAP are left out, and named. Below
     `FEW` photographs, where COLMAP's own settings find little, features use domain-size pooling and affine shapes,
-    points need two photographs instead of three, and the focal lengths are kept if EXIF data give them for all
-    photographs, since so few determine them less well. Below `MANY`, small photographs are enlarged for their features.
-    A last bundle adjustment has a robust loss. The model is written atomically, and the result is deterministic.
+    points need two photographs instead of three, small photographs are enlarged, and the focal lengths are kept if EXIF
+    data give them for all photographs, since so few determine them less well. A last bundle adjustment has a robust
+    loss. The model is written atomically, and the result is deterministic.
 
     Args:
         scene: the scene folder.
@@ -200,7 +198,7 @@ def _reconstruct(
         pycolmap.import_images(
             database, folder, camera_mode=pycolmap.CameraMode.SINGLE, image_names=names, options=reader
         )
-    sizes = enlarge(photos, database, larger)
+    sizes = enlarge(photos, database, larger) if few else {}
     folder = larger if sizes else folder
 
     extract = partial(
@@ -246,7 +244,7 @@ def enlarge(photos: list[Path], database: Path, folder: Path) -> dict[int, tuple
     with closing(pycolmap.Database.open(database)) as opened:
         for camera in opened.read_all_cameras():
             size = camera.width, camera.height
-            larger = feature_size(*size, len(photos))
+            larger = feature_size(*size, few=True)
             if larger > size:
                 sizes[camera.camera_id] = size
                 camera.rescale(*larger)
