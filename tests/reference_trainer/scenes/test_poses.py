@@ -17,6 +17,7 @@ from reference_trainer import cli
 from reference_trainer.cli import main
 from reference_trainer.scenes import load_scene, poses
 from reference_trainer.scenes.colmap import read_colmap
+from reference_trainer.scenes.images import image_size
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.poses import _write, find_poses
 
@@ -200,6 +201,32 @@ def test_what_only_colmap_cannot_read_is_left_out_too(noise, monkeypatch):
     said = str(find_poses(noise))
     assert "3 of 4 photographs registered" in said
     assert re.search(r"left out: COLMAP cannot read .*3\.webp, .*: save it as JPEG", said)
+
+
+def test_small_photographs_are_enlarged_with_their_cameras(tmp_path):
+    """What EXIF data tell of the focal length is enlarged with them; a large photograph stays as it is."""
+    pycolmap = pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
+    photos, exif = [tmp_path / "a.jpg", tmp_path / "b.jpg"], Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 18  # focal length on 35 mm film: half the width of 36 mm
+    for photo, size in zip(photos, ((400, 300), (1700, 1200)), strict=True):
+        Image.new("RGB", size).save(photo, exif=exif)
+    database = tmp_path / "database.db"
+    pycolmap.Database.open(database).close()
+    for photo in photos:
+        pycolmap.import_images(
+            database, tmp_path, camera_mode=pycolmap.CameraMode.SINGLE, image_names=[photo.name],
+            options=pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE"),
+        )  # fmt: skip
+    sizes = poses.enlarge(photos, database, tmp_path / "larger")
+    assert [*sizes.values()] == [(400, 300)]
+    assert [image_size(tmp_path / "larger" / photo.name) for photo in photos] == [(800, 600), (1700, 1200)]
+    opened = pycolmap.Database.open(database)
+    cameras = [opened.read_camera(opened.read_image_with_name(photo.name).camera_id) for photo in photos]
+    opened.close()
+    assert [camera.has_prior_focal_length for camera in cameras] == [True, True]
+    assert [camera.width for camera in cameras] == [800, 1700]
+    for camera in cameras:  # of 35 mm film COLMAP takes the diagonal
+        assert camera.mean_focal_length() == pytest.approx(18 / 43.27 * np.hypot(camera.width, camera.height), rel=0.01)
 
 
 def test_two_photographs_must_remain(noise, monkeypatch):
