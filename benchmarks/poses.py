@@ -22,7 +22,6 @@ from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.scenes.load import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.poses import find_poses
-from reference_trainer.scenes.scene import Scene
 
 __all__ = ["errors", "line"]
 
@@ -31,9 +30,7 @@ COMPARED = ("fern", "herz-jesu", "fountain", "sceaux", "cape")
 
 
 def errors(found: list[Camera], true: list[Camera]) -> tuple[float, float, float]:
-    """Return the largest error of a rotation, degrees, and of a center, by the largest distance, and that of the focal
-    length, as a share of the true one.
-    """
+    """Return the largest errors of rotations, degrees, and centers, by the largest distance; and the focal length's."""
     (turns, p), (true_turns, q) = _axes_and_centers(found), _axes_and_centers(true)
     u, _, v = np.linalg.svd(np.einsum("nij,nik->jk", true_turns, turns))  # the rotation between the two worlds
     world = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
@@ -61,7 +58,7 @@ def line(data: Path, name: str) -> dict[str, str]:
         begun = time.process_time()
         result = find_poses(work)
         seconds = time.process_time() - begun
-        scene: Scene = load_scene(SceneOptions(work, points="random:100"), trains=False)
+        scene = load_scene(SceneOptions(work, points="random:100"), trains=False)
     cameras = {Path(view.name).name: view.camera for view in scene.train}
     placed = [view for view in true if Path(view.name).name in cameras]
     degrees, apart, focal = errors([cameras[Path(view.name).name] for view in placed], [view.camera for view in placed])
