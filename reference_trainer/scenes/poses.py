@@ -32,7 +32,7 @@ LARGEST_SIDE = 1600
 ENLARGED = 2
 """Fewer than `FEW` photographs that are smaller are enlarged so many times at most: several times as many features."""
 CERTAIN = 0.5
-"""Pixels beyond which a feature counts as an outlier in the last bundle adjustment."""
+"""Pixels of error beyond which a feature counts less and less in the last bundle adjustment."""
 
 
 @dataclass(frozen=True)
