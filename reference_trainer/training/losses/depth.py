@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import unfold
 
 from ca_reg._check import check_count, check_finite
+from ca_reg.neighbors import nearest_neighbors
 from ca_reg.schedules import Schedule
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.losses.term import PriorTerm, WeightedTerm
@@ -188,33 +189,63 @@ class Warp(WeightedTerm):
     """``weight * (mean|M (warped - photograph)| + smooth * smoothness(M disparity))`` of Binocular3DGS (NeurIPS 2024).
 
     A camera shifted along its x axis by t, drawn from -shift to shift, is rendered with the plain model and warped back
-    by the disparity ``-fx t / (depth + 1e-5)`` of the step's render; M is 1 where the warp stays inside.
+    by the disparity ``-fx t / (depth + 1e-5)`` of the step's render; M is 1 where the warp stays inside. Our own addition
+    is ``hidden``: M is 0 where something stands between the shifted camera and what the pixel shows.
 
     Args:
         weight: at least 0, or a schedule. The source begins at step 20,000 of 30,000: ``between(1.0, 20_000)``.
-        shift: largest shift, above 0, world units: for a world in other units than the source's, scale it.
+        shift: largest shift, above 0, world units; or, if ``relative``, distances between cameras.
         smooth: weight of the smoothness, at least 0.
+        relative: whether shifts count in distances from a training camera to the nearest other one, in the mean over
+            them, so that the unit of length does not matter. Where all cameras are in one place the term is left out.
+        hidden: largest difference between the depth of the step's render and that of the shifted one, warped back, as a
+            share of the former, above 0; what differs more is hidden. None takes nothing for hidden.
     """
 
     needs = frozenset({"depth"})
 
-    def __init__(self, weight: float | Schedule = 1.0, shift: float = 0.4, smooth: float = 0.05) -> None:
+    def __init__(
+        self,
+        weight: float | Schedule = 1.0,
+        shift: float = 0.4,
+        smooth: float = 0.05,
+        relative: bool = False,
+        hidden: float | None = None,
+    ) -> None:
         super().__init__(weight)
-        if not shift > 0:
-            raise ValueError(f"shift must be positive, got {shift}.")
+        for name, value in (("shift", shift), ("hidden", hidden)):
+            if value is not None and not value > 0:
+                raise ValueError(f"{name} must be positive, got {value}.")
         check_finite(smooth, "smooth", minimum=0)
-        self.shift, self.smooth = shift, smooth
+        self.shift, self.smooth, self.relative, self.hidden = shift, smooth, relative, hidden
+        self._unit = 1.0  # of shifts, in the world's
+
+    def begin(self, scene: Scene) -> None:
+        """Measure how far apart the training cameras are."""
+        if self.relative:
+            positions = torch.stack([view.camera.position for view in scene.train])
+            squares = nearest_neighbors(positions, 1)[0] if len(positions) > 1 else torch.zeros(1)
+            self._unit = squares.sqrt().mean().item()
+
+    def acts(self, number: int) -> bool:
+        """Return whether the weight at this step is not 0, and there is a shift."""
+        return self._unit > 0 and super().acts(number)
 
     def value(self, step: Step) -> Tensor:
         """Render the shifted camera and compare."""
         camera, photograph, generator = step.view.camera, step.view.image, step.generator("warp")
-        shift = self.shift * (2 * torch.rand((), generator=generator, device=generator.device) - 1).item()
+        shift = self.shift * self._unit * (2 * torch.rand((), generator=generator, device=generator.device) - 1).item()
         pose = camera.world_to_camera.clone()
         # x_camera = R x + t: moving the camera by +shift along its own x axis lowers t_x.
         pose[0, 3] -= shift
-        shifted = step.render(replace(camera, world_to_camera=pose)).image
+        shifted = step.render(replace(camera, world_to_camera=pose), depth=self.hidden is not None)
         disparity = -camera.fx * shift / (step.depth + 1e-5)
-        warped, inside = warp_horizontally(shifted, disparity)
+        warped, inside = warp_horizontally(shifted.image, disparity)
+        if self.hidden is not None:
+            assert shifted.depth is not None
+            # A shift along x changes no depth: a point that both cameras see has the same in both.
+            there, _ = warp_horizontally(shifted.depth.detach()[None], disparity.detach())
+            inside = inside * ((there[0] - step.depth).abs() < self.hidden * step.depth)
         error = (inside * (warped - photograph)).abs().mean()
         return error + self.smooth * edge_aware_smoothness(inside * disparity, photograph)
 

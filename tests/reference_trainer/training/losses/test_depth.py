@@ -1,6 +1,7 @@
 """Terms of the depth against numpy."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians
+from reference_trainer.scenes.scene import PointCloud, Scene
 from reference_trainer.training.losses import LOSSES
 from reference_trainer.training.losses.depth import (
     PatchDepth,
@@ -268,20 +270,26 @@ def test_warp_and_smoothness_are_the_formulas():
     assert found == pytest.approx(literal_smoothness(disparity.numpy(), image.numpy()), rel=1e-12)
 
 
-def test_the_term_is_the_formula(six, take_step):
+@pytest.mark.parametrize("hidden", [None, 0.02])
+def test_the_term_is_the_formula(six, take_step, hidden):
     step = take_step(seed=3)
-    term, camera = Warp(0.7, shift=0.3, smooth=0.2), step.view.camera
+    term, camera = Warp(0.7, shift=0.3, smooth=0.2, hidden=hidden), step.view.camera
     places = []
     render = step.render
-    step.render = lambda camera: places.append(camera) or render(camera)
+    step.render = lambda camera, **options: places.append(camera) or render(camera, **options)
     value = term(step).item()
     assert value == term(step).item(), "the shift is the step's"
     shift = (places[0].position - camera.position) @ camera.world_to_camera[0, :3]
     assert 0 < abs(shift) <= 0.3
     assert (places[0].position - camera.position - shift * camera.world_to_camera[0, :3]).abs().max() < 1e-12
-    shifted = render_gaussians(six, places[0], step.background).image.numpy()
+    shifted = render_gaussians(six, places[0], step.background, depth=True)
     disparity = (-camera.fx * shift / (step.depth + 1e-5)).numpy()
-    warped, inside = literal_warp(shifted, disparity)
+    warped, inside = literal_warp(shifted.image.numpy(), disparity)
+    if hidden is not None:
+        there, depth = literal_warp(shifted.depth.numpy()[None], disparity)[0][0], step.depth.numpy()
+        seen = inside * (np.abs(there - depth) < hidden * depth)
+        assert 0 < seen.sum() < inside.sum()
+        inside = seen
     photograph = step.view.image.numpy()
     expected = np.abs(inside * (warped - photograph)).mean() + 0.2 * literal_smoothness(inside * disparity, photograph)
     assert value == pytest.approx(0.7 * expected, rel=1e-9)
@@ -295,7 +303,7 @@ def test_shifts_go_both_ways_up_to_the_largest(take_step):
         step = take_step(seed=seed)
         rendering, camera = step.rendering, step.view.camera
 
-        def render(moved, rendering=rendering, camera=camera):
+        def render(moved, rendering=rendering, camera=camera, **_):
             shifts.append(((moved.position - camera.position) @ camera.world_to_camera[0, :3]).item())
             return rendering
 
@@ -329,6 +337,44 @@ def test_the_true_depth_of_a_plane_warps_its_render_onto_the_photograph():
     assert min(errors[1:]) > 5 * errors[0]
 
 
+def test_what_a_shifted_camera_does_not_see_is_left_out(take_step):
+    """Known pictures of a strip at depth 2 before a wall at depth 4: of two columns of the wall the strip is in the way."""
+    step, colors, columns = (
+        take_step(seed=1),
+        torch.rand(200, generator=torch.Generator().manual_seed(0)),
+        torch.arange(25),
+    )
+
+    def seen(moved):
+        """The picture and the depth of a camera that a point at depth 1 shows to have moved by so many pixels."""
+        strip = (columns + moved / 2 >= 9) & (columns + moved / 2 < 14)
+        depth = torch.where(strip, 2.0, 4.0).double()
+        texture = colors[(columns + moved / depth).long() + 100 * strip].double()
+        return SimpleNamespace(image=texture.expand(3, 17, 25), depth=depth.expand(17, 25))
+
+    def shifted(camera, depth=False):
+        assert (camera.position - step.view.camera.position).norm() * camera.fx == pytest.approx(8)
+        return seen(8)
+
+    step.view, step.rendering, step.render = dataclasses.replace(step.view, image=seen(0).image), seen(0), shifted
+    drawn = 2 * torch.rand((), generator=step.generator("warp")).item() - 1
+    errors = [Warp(shift=8 / step.view.camera.fx / drawn, smooth=0.0, hidden=x)(step).item() for x in (None, 0.02)]
+    in_the_way = (colors[7:9] - colors[[109, 110]]).abs().sum().item() / 25
+    assert errors == pytest.approx([in_the_way, 0], abs=1e-4)
+
+
+def test_a_relative_shift_counts_in_distances_between_cameras(take_step, three_views):
+    """The three cameras stand 0.1 apart."""
+    points = PointCloud(torch.zeros(1, 3), torch.zeros(1, 3), "none")
+    scene = Scene("three", tuple(three_views), (), points, torch.zeros(3))
+    relative, absolute = Warp(shift=0.5, relative=True), Warp(shift=0.05)
+    relative.begin(scene)
+    assert relative(take_step()).item() == pytest.approx(absolute(take_step()).item(), rel=1e-6)
+    for views in (three_views[:1], three_views[:1] * 2):
+        relative.begin(dataclasses.replace(scene, train=tuple(views)))
+        assert not relative.acts(0)
+
+
 def test_gradients_of_warp(assert_gradients_of_differences):
     assert_gradients_of_differences(Warp(0.7, smooth=0.2), "means", "opacity_logits", "log_scales", seed=3)
 
@@ -336,6 +382,7 @@ def test_gradients_of_warp(assert_gradients_of_differences):
 def test_arguments_of_warp():
     for text, message in (
         ("warp(shift=0.0)", "shift must be positive"),
+        ("warp(hidden=0.0)", "hidden must be positive"),
         ("warp(smooth=-1.0)", "smooth must be finite and at least 0, got -1.0"),
         ("warp(-1.0)", "weight must"),
     ):
