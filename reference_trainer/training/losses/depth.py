@@ -190,7 +190,7 @@ class Warp(WeightedTerm):
 
     A camera shifted along its x axis by t, drawn from -shift to shift, is rendered with the plain model and warped back
     by the disparity ``-fx t / (depth + 1e-5)`` of the step's render; M is 1 where the warp stays inside. Our own addition
-    is ``hidden``: M is 0 where something stands between the shifted camera and what the pixel shows.
+    is ``hidden``: the first M is 0 where something stands between the shifted camera and what the pixel shows.
 
     Args:
         weight: at least 0, or a schedule. The source begins at step 20,000 of 30,000: ``between(1.0, 20_000)``.
@@ -241,12 +241,14 @@ class Warp(WeightedTerm):
         shifted = step.render(replace(camera, world_to_camera=pose), depth=self.hidden is not None)
         disparity = -camera.fx * shift / (step.depth + 1e-5)
         warped, inside = warp_horizontally(shifted.image, disparity)
+        seen = inside
         if self.hidden is not None:
             assert shifted.depth is not None
             # A shift along x changes no depth: a point that both cameras see has the same in both.
             there, _ = warp_horizontally(shifted.depth.detach()[None], disparity.detach())
-            inside = inside * ((there[0] - step.depth).abs() < self.hidden * step.depth)
-        error = (inside * (warped - photograph)).abs().mean()
+            seen = inside * ((there[0] - step.depth).abs() < self.hidden * step.depth)
+        error = (seen * (warped - photograph)).abs().mean()
+        # The smoothness is not masked by it: at the border of a hole it would pull the disparity to 0.
         return error + self.smooth * edge_aware_smoothness(inside * disparity, photograph)
 
 

@@ -285,13 +285,13 @@ def test_the_term_is_the_formula(six, take_step, hidden):
     shifted = render_gaussians(six, places[0], step.background, depth=True)
     disparity = (-camera.fx * shift / (step.depth + 1e-5)).numpy()
     warped, inside = literal_warp(shifted.image.numpy(), disparity)
+    seen = inside
     if hidden is not None:
         there, depth = literal_warp(shifted.depth.numpy()[None], disparity)[0][0], step.depth.numpy()
         seen = inside * (np.abs(there - depth) < hidden * depth)
         assert 0 < seen.sum() < inside.sum()
-        inside = seen
     photograph = step.view.image.numpy()
-    expected = np.abs(inside * (warped - photograph)).mean() + 0.2 * literal_smoothness(inside * disparity, photograph)
+    expected = np.abs(seen * (warped - photograph)).mean() + 0.2 * literal_smoothness(inside * disparity, photograph)
     assert value == pytest.approx(0.7 * expected, rel=1e-9)
     assert len(step.observed) == 1, "density control sees the render of the step alone"
 
