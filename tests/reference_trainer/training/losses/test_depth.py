@@ -338,12 +338,9 @@ def test_the_true_depth_of_a_plane_warps_its_render_onto_the_photograph():
 
 
 def test_what_a_shifted_camera_does_not_see_is_left_out(take_step):
-    """Known pictures of a strip at depth 2 before a wall at depth 4: of two columns of the wall the strip is in the way."""
-    step, colors, columns = (
-        take_step(seed=1),
-        torch.rand(200, generator=torch.Generator().manual_seed(0)),
-        torch.arange(25),
-    )
+    """Known pictures of a strip at depth 2 before a wall at depth 4: it is in the way of two columns of the wall."""
+    step, columns = take_step(seed=1), torch.arange(25)
+    colors = torch.rand(200, generator=torch.Generator().manual_seed(0))
 
     def seen(moved):
         """The picture and the depth of a camera that a point at depth 1 shows to have moved by so many pixels."""
