@@ -189,8 +189,8 @@ class Warp(WeightedTerm):
     """``weight * (mean|M (warped - photograph)| + smooth * smoothness(M disparity))`` of Binocular3DGS (NeurIPS 2024).
 
     A camera shifted along its x axis by t, drawn from -shift to shift, is rendered with the plain model and warped back
-    by the disparity ``-fx t / (depth + 1e-5)`` of the step's render; M is 1 where the warp stays inside. ``hidden``, our
-    own addition, sets the first M to 0 where something stands between the shifted camera and what the pixel shows.
+    by the disparity ``-fx t / (depth + 1e-5)`` of the step's render; M is 1 where the warp stays inside. Our own
+    ``hidden`` sets the first M to 0 where something stands between the shifted camera and what the pixel shows.
 
     Args:
         weight: at least 0, or a schedule. The source begins at step 20,000 of 30,000: ``between(1.0, 20_000)``.
