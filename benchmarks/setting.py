@@ -27,6 +27,7 @@ from benchmarks.guard import OTHER_EXPOSURE, quality
 from benchmarks.paper.rows import Rows, value
 from benchmarks.paper.scenes import SCENES
 from benchmarks.remedy import held_out
+from benchmarks.start_scenes import SIFT
 from reference_trainer.evaluation.lpips import LPIPS, load_lpips
 from reference_trainer.evaluation.metrics import on_white
 from reference_trainer.evaluation.results import write_json
@@ -44,6 +45,7 @@ __all__ = [
     "controls",
     "differences",
     "failures",
+    "fourth",
     "judging",
     "main",
     "measured",
@@ -68,6 +70,8 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "degree 1": ("sh_degree", 1),
     "random background": ("random_background", True),
     "warp": ("loss", "warp("),
+    "hidden left out": ("loss", "hidden="),
+    "no smoothness": ("loss", "smooth=0.0"),
     "depth of the points": ("loss", "pearson("),
     "flat": ("loss", "flat("),
 }
@@ -77,6 +81,8 @@ CHOSEN = "drawn"
 """What the first choice chose, and the second started from: ``--recipe sparse --densify-from 150``."""
 LATER = "from 1,000"
 """What the second choice chose: ``--recipe sparse``."""
+DENSE = "from 1,000, dense start"
+"""The same as a user has it, with the start that it has by default."""
 SEEDS = 5
 """So many, from 0 on, judge the chosen one."""
 FEWEST = 3
@@ -146,6 +152,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
         controls(rows),
         starts(rows),
         third(rows),
+        fourth(rows),
         failures(rows),
     ]
 
@@ -234,17 +241,34 @@ def second(rows: Sequence[Row], seeds: Sequence[int] = (0,)) -> str:
 
 
 def third(rows: Sequence[Row]) -> str:
-    """Return the table of the third choice, from the dense start: gains at held-out / test views, and Gaussians."""
+    """Return the table of the third choice: gains over the recipe with the same seed, 0."""
+    return _gains(rows, ("rate 0.3", "no reset", "threshold 3e-4"), seeds=(0,))
+
+
+def fourth(rows: Sequence[Row]) -> str:
+    """Return the table of the fourth choice: gains of seed 0 over the mean of the recipe's seeds."""
+    warps = ("warp", "warp + no smoothness", "warp + hidden left out", "warp + hidden left out + no smoothness")
+    return _gains(rows, (*warps, "depth of the points"), seeds=range(FEWEST))
+
+
+def _gains(rows: Sequence[Row], names: Sequence[str], *, seeds: Iterable[int]) -> str:
+    """Return a table of what candidates gain with the dense start: at held-out / test views, and Gaussians.
+
+    Args:
+        rows: all of them.
+        names: of what the candidates add to the recipe; their seed is 0.
+        seeds: of the recipe's trainings over whose mean they gain.
+    """
     lines = []
-    for name in ("rate 0.3", "no reset", "threshold 3e-4"):
+    for name in names:
         line, gains = {"candidate": name}, list[tuple[float, float]]()
         for scene in HELD_OUT:
-            start = f"{scene}, {'dense' if scene.startswith('dtu') else 'dense and few'}"
-            before, after = (rows_of(rows, start, x).get(0) for x in (LATER, f"{LATER} + {name}"))
-            if before and after:
-                held_out = after["held-out"] - before["held-out"]
-                gains.append((held_out, value(after, "test psnr") - value(before, "test psnr")))
-                more = after["gaussians"] / before["gaussians"]
+            recipe, own = (rows_of(rows, _from_dense(scene), x) for x in (LATER, f"{LATER} + {name}"))
+            before = [recipe[seed] for seed in seeds if seed in recipe]
+            if before and (after := own.get(0)):
+                held_out = after["held-out"] - fmean(row["held-out"] for row in before)
+                gains.append((held_out, value(after, "test psnr") - fmean(value(row, "test psnr") for row in before)))
+                more = after["gaussians"] / fmean(row["gaussians"] for row in before)
                 line[scene] = "{:+.2f} / {:+.2f}, {:.2f}".format(*gains[-1], more)
         if gains:
             means = map(fmean, zip(*gains, strict=True))
@@ -392,7 +416,8 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     """Return the table of the seeds: median, spread and the worst by scene and setting, and how often one fails."""
     lines, counts, below = [], dict[str, list[bool]](), dict[str, list[bool]]()
     for scene in FAILING:
-        every = {name: rows_of(rows, scene, name) for name in (LATER, CHOSEN)}
+        every = {DENSE: rows_of(rows, _from_dense(scene), LATER)}
+        every |= {name: rows_of(rows, scene, name) for name in (LATER, CHOSEN)}
         every |= _references(rows, references, scene)
         figures = {
             name: {seed: value(row, "test psnr") for seed, row in of.items()}
@@ -423,6 +448,11 @@ def _scene(options: SceneOptions) -> str:
     """Return the name of a scene, with its points where these are others than the scene's own."""
     start = STARTS.get(options.points)
     return Path(options.path).name + (f", {start}" if start else "")
+
+
+def _from_dense(scene: str) -> str:
+    """Return the name of a scene that begins with a dense start, and with few measured points where there are any."""
+    return f"{scene}, {'dense and few' if scene in SIFT else 'dense'}"
 
 
 def _is_second(candidate: str) -> bool:

@@ -116,3 +116,19 @@ def test_a_candidate_of_the_second_choice_gains_over_the_mean_of_the_seeds():
     (line,) = [x for x in setting.second(rows).splitlines() if x.startswith("| flat")]
     assert [x.strip() for x in line.split("|")[2:-1]] == ["+0.50", "-1.00", "-0.25", "2"]
     assert "flat" not in setting.second(rows, (0, 1))  # no seed 1
+
+
+def test_a_candidate_of_the_later_choices_gains_with_the_start_of_the_recipe():
+    start = "fern, dense and few"
+    rows = [row(start, "from 1,000", seed, 25.0 + seed, 20.0 + seed) for seed in (0, 1, 2)]
+    rows += [row(start, f"from 1,000 + {name}", 0, 26.5, 22.0) for name in ("warp", "rate 0.3")]
+    rows += [row("fern", "from 1,000 + warp", 0, 99.0, 99.0)]
+    for table, gains in ((setting.third, "+2.00 / +1.50, 1.00"), (setting.fourth, "+1.00 / +0.50, 1.00")):
+        (line,) = [x for x in table(rows).splitlines() if x.startswith(("| warp", "| rate"))]
+        assert [x.strip() for x in line.split("|")[2:-1]] == [gains, gains.partition(",")[0], "1"]
+
+
+def test_a_warp_is_named_by_what_it_leaves_out():
+    for loss, name in (("shift=0.36", "warp"), ("shift=0.15, relative=True, hidden=0.02", "warp + hidden left out")):
+        config = with_recipe("sparse", iterations=3_000, loss=f"photometric + warp(between(1.0, 2000), {loss})")
+        assert setting.candidate(config) == f"from 1,000 + {name}"

@@ -258,12 +258,10 @@ def test_a_folder_with_one_video_is_enough(tmp_path, capsys, monkeypatch):
 def test_three_real_photographs_from_nothing_to_the_page(data_root, tmp_path, capsys, monkeypatch):
     pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
     monkeypatch.setattr(photos, "PRESETS", {"quick": (30, 20_000)})
-    names = json.loads((data_root / "fern/split.json").read_text())["train"]
-    (tmp_path / "fern").mkdir()
-    for name in names:
-        with Image.open(data_root / "fern/images_8" / name) as picture:
-            picture.convert("RGB").save(tmp_path / "fern" / f"{name[:-4]}.jpg", quality=95)
-    main(["run", str(tmp_path / "fern"), "--out", str(tmp_path / "out"), "--quick", "--no-open"])
+    (tmp_path / "portal").mkdir()
+    for name in json.loads((data_root / "herz-jesu/split_near.json").read_text())["train_3"]:
+        shutil.copy(data_root / "herz-jesu/images" / name, tmp_path / "portal")
+    main(["run", str(tmp_path / "portal"), "--out", str(tmp_path / "out"), "--quick", "--no-open"])
     said = capsys.readouterr().out
     assert "3 of 3 photographs registered" in said
     assert re.search(
