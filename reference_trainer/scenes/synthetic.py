@@ -272,17 +272,18 @@ def render_solids(camera: Camera, solids: Sequence[Solid], light: Tensor) -> tup
     directions = (camera.lift(torch.stack([x, y], dim=-1), torch.ones(shape)) - position).reshape(-1, 3)
     origins = position.expand_as(directions)
     t, index = nearest_hit(solids, origins, directions)  # directions have unit z in the camera, so t is the depth
-    radiance = torch.zeros_like(directions)
-    targets = light.repeat(camera.height * camera.width, 1)
+    hit = t.isfinite()
+    points, index = (origins + t[:, None] * directions)[hit], index[hit]
+    normals, reflectances = torch.empty_like(points), torch.empty_like(points)
     for number, solid in enumerate(solids):
-        mine = (index == number) & t.isfinite()
-        points = origins[mine] + t[mine, None] * directions[mine]
-        normals = solid.normals(points)
-        start = points + SHADOW_OFFSET * normals
-        to_light = targets[mine] - start
-        lit = nearest_hit(solids, start, to_light)[0] > 1
-        cosine = (normals * torch.nn.functional.normalize(to_light, dim=1)).sum(1).clamp_min(0)
-        radiance[mine] = solid.texture(points) * (AMBIENT + (1 - AMBIENT) * cosine * lit)[:, None]
+        mine = index == number
+        normals[mine], reflectances[mine] = solid.normals(points[mine]), solid.texture(points[mine])
+    start = points + SHADOW_OFFSET * normals
+    to_light = light.repeat(camera.height * camera.width, 1)[hit] - start
+    lit = nearest_hit(solids, start, to_light)[0] > 1
+    cosine = (normals * torch.nn.functional.normalize(to_light, dim=1)).sum(1).clamp_min(0)
+    radiance = torch.zeros_like(directions)
+    radiance[hit] = reflectances * (AMBIENT + (1 - AMBIENT) * cosine * lit)[:, None]
     image = radiance.reshape(camera.height, camera.width, SAMPLES**2, 3).mean(2).clamp(0, 1).pow(1 / GAMMA)
     depth = t.reshape(camera.height, camera.width, SAMPLES**2)[:, :, SAMPLES**2 // 2]
     return image.permute(2, 0, 1).contiguous(), torch.where(depth.isfinite(), depth, 0)
