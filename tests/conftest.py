@@ -105,6 +105,9 @@ class _WithoutTriton:
 def pytest_configure(config):
     """Prepare what must be before the first test."""
     register_card()
+    # Tests outlive no power cut, and waiting for the disk is a tenth of their time. Those that pretend one, in
+    # tests/reliability, do so in processes of their own.
+    os.fsync = lambda handle: None
     if find_spec("triton") is None:
         config.pluginmanager.register(_WithoutTriton())
     # A shell starts background jobs deaf to Ctrl-C, and some tests send it to themselves.
