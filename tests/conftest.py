@@ -105,8 +105,8 @@ class _WithoutTriton:
 def pytest_configure(config):
     """Prepare what must be before the first test."""
     register_card()
-    # Tests outlive no power cut, and waiting for the disk is a tenth of their time. Those that pretend one, in
-    # tests/reliability, do so in processes of their own.
+    # No file of a test outlives it, so none need wait for the disk. Those of tests/reliability that pretend power cuts
+    # do so in processes of their own.
     os.fsync = lambda handle: None
     if find_spec("triton") is None:
         config.pluginmanager.register(_WithoutTriton())
