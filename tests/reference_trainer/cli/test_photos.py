@@ -257,7 +257,7 @@ def test_a_folder_with_one_video_is_enough(tmp_path, capsys, monkeypatch):
 @pytest.mark.data
 def test_three_real_photographs_from_nothing_to_the_page(data_root, tmp_path, capsys, monkeypatch):
     pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
-    monkeypatch.setattr(photos, "PRESETS", {"quick": (30, 20_000)})
+    monkeypatch.setattr(photos, "PRESETS", {"quick": (100, 20_000)})
     (tmp_path / "portal").mkdir()
     for name in json.loads((data_root / "herz-jesu/split_near.json").read_text())["train_3"]:
         shutil.copy(data_root / "herz-jesu/images" / name, tmp_path / "portal")
