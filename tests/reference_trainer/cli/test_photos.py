@@ -257,7 +257,7 @@ def test_a_folder_with_one_video_is_enough(tmp_path, capsys, monkeypatch):
 @pytest.mark.data
 def test_three_real_photographs_from_nothing_to_the_page(data_root, tmp_path, capsys, monkeypatch):
     pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
-    monkeypatch.setattr(photos, "PRESETS", {"quick": (100, 20_000)})
+    monkeypatch.setattr(photos, "PRESETS", {"quick": (300, 20_000)})
     (tmp_path / "portal").mkdir()
     for name in json.loads((data_root / "herz-jesu/split_near.json").read_text())["train_3"]:
         shutil.copy(data_root / "herz-jesu/images" / name, tmp_path / "portal")
@@ -270,4 +270,4 @@ def test_three_real_photographs_from_nothing_to_the_page(data_root, tmp_path, ca
     assert (tmp_path / "out/report.html").stat().st_size > 1e5  # with pictures and model
     results = json.loads((tmp_path / "out/results.json").read_text())
     assert set(results["mean"]) == {"train", "between", "around"}
-    assert results["mean"]["train"]["psnr"] > 12
+    assert results["mean"]["train"]["psnr"] > 18  # one color has 15
