@@ -1,4 +1,4 @@
-"""The tutorial, on three photographs of a portal: its commands in their order, with fewer steps, smaller pictures."""
+"""The tutorial, on three photographs of a portal: its commands in order, with fewer steps and smaller pictures."""
 
 import shlex
 import shutil
