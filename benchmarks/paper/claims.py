@@ -46,7 +46,7 @@ QUALITY = (_PSNR, "test ssim", "test lpips", _CA, "test ca_exact_half", "test de
 """The columns of a table of models, as far as they were measured."""
 TIMED = (*QUALITY, "seconds", "pace")
 """The same for models that were trained on one machine."""
-_FEW = ("synthetic", "herz-jesu")
+_FEW = ("synthetic", "herz-jesu", "fern")
 _WITH_MORE = ("synthetic", "fern")  # scenes with more than nine photographs to train on
 
 
@@ -195,7 +195,7 @@ CLAIMS = {
     "7": Claim("the dropout rate 0.2 is best, no other 0.1 dB above it, and 0.3 to 0.5 less than 0.3 dB below",
                "Binocular3DGS: 21.44, 21.90, 22.12, 22.04, 22.03, 21.93, 21.79 dB for 0 to 0.6", tuple(_RATE.values()),
                (_higher(_PSNR, _DROPOUT, _PLAIN), *(Check(_PSNR, _RATE[p], _DROPOUT, high=0.1) for p in (0.1, 0.6)),
-                *(Check(_PSNR, _RATE[p], _DROPOUT, -0.3, 0.1) for p in (0.3, 0.4, 0.5))), scenes=(*_FEW, "fern")),
+                *(Check(_PSNR, _RATE[p], _DROPOUT, -0.3, 0.1) for p in (0.3, 0.4, 0.5))), ),
     "8": Claim("noise of 0.8 helps, 0.4 to 1.0 are alike to 0.2 dB, and CA falls with its scale",
                "Binocular3DGS: 21.44 dB without, 22.07, 22.00, 22.12, 22.05 dB at 0.4, 0.6, 0.8, 1.0; CA 1.95 -> 0.64",
                tuple(_SIGMA.values()),

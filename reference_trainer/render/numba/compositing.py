@@ -67,32 +67,43 @@ def _finish(state: Any, background: Any, transmittance: Any, image: Any, tile: A
     tiles.store(state, _RED, image, tile, columns)
 
 
-@kernel
-def _forward(
-    first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array,
-    transmittance: Array, image: Array,
-) -> None:  # fmt: skip
-    s, entries = np.empty(4 * PIXELS, f4), np.empty((CHUNK + 1, 9), f4)
-    for tile in range(first, last):
-        s[:] = _ZERO
-        s[_TRANSMITTANCE : _TRANSMITTANCE + PIXELS] = _ONE
-        for begin in range(starts[tile], starts[tile + 1], CHUNK):
-            end = min(begin + CHUNK, starts[tile + 1])
-            # Two splats at a time: the sums of a pixel are then loaded and stored half as often.
-            for k in range(0, tiles.read_entries(gaussians, begin, end, 1, table, tile, columns, entries), 2):
-                a, b = entries[k], entries[k + 1]
-                shape_a, shape_b = tiles.footprint_of(a), tiles.footprint_of(b)
-                red_a, green_a, blue_a, red_b, green_b, blue_b = a[6], a[7], a[8], b[6], b[7], b[8]
-                for p in range(PIXELS):
-                    weight_a, between = _pass(tiles.clamped(tiles.alpha_at(shape_a, p)), s[_TRANSMITTANCE + p])
-                    weight_b, rest = _pass(tiles.clamped(tiles.alpha_at(shape_b, p)), between)
-                    s[_RED + p] += weight_a * red_a + weight_b * red_b
-                    s[_GREEN + p] += weight_a * green_a + weight_b * green_b
-                    s[_BLUE + p] += weight_a * blue_a + weight_b * blue_b
-                    s[_TRANSMITTANCE + p] = rest
-            if _have_ended(s):
-                break
-        _finish(s, background, transmittance, image, tile, columns)
+def _make_forward(depth: bool) -> Any:
+    """Return the kernel of the image, with depth as its fourth channel if asked for."""
+
+    @kernel
+    def _forward(
+        first: int, last: int, columns: int, starts: Array, gaussians: Array, table: Array, background: Array,
+        transmittance: Array, image: Array,
+    ) -> None:  # fmt: skip
+        s, entries = np.empty((5 if depth else 4) * PIXELS, f4), np.empty((CHUNK + 1, 10 if depth else 9), f4)
+        for tile in range(first, last):
+            s[:] = _ZERO
+            s[_TRANSMITTANCE : _TRANSMITTANCE + PIXELS] = _ONE
+            for begin in range(starts[tile], starts[tile + 1], CHUNK):
+                end = min(begin + CHUNK, starts[tile + 1])
+                # Two splats at a time: the sums of a pixel are then loaded and stored half as often.
+                for k in range(0, tiles.read_entries(gaussians, begin, end, 1, table, tile, columns, entries), 2):
+                    a, b = entries[k], entries[k + 1]
+                    shape_a, shape_b = tiles.footprint_of(a), tiles.footprint_of(b)
+                    red_a, green_a, blue_a, red_b, green_b, blue_b = a[6], a[7], a[8], b[6], b[7], b[8]
+                    depth_a, depth_b = (a[9], b[9]) if depth else (_ZERO, _ZERO)
+                    for p in range(PIXELS):
+                        weight_a, between = _pass(tiles.clamped(tiles.alpha_at(shape_a, p)), s[_TRANSMITTANCE + p])
+                        weight_b, rest = _pass(tiles.clamped(tiles.alpha_at(shape_b, p)), between)
+                        s[_RED + p] += weight_a * red_a + weight_b * red_b
+                        s[_GREEN + p] += weight_a * green_a + weight_b * green_b
+                        s[_BLUE + p] += weight_a * blue_a + weight_b * blue_b
+                        if depth:
+                            s[_DEPTH + p] += weight_a * depth_a + weight_b * depth_b
+                        s[_TRANSMITTANCE + p] = rest
+                if _have_ended(s):
+                    break
+            _finish(s, background, transmittance, image, tile, columns)
+
+    return _forward
+
+
+_forward, _forward_with_depth = _make_forward(False), _make_forward(True)
 
 
 @inlined
@@ -150,8 +161,8 @@ def _masked(
             _finish(states[mask], background, transmittances[mask], images[mask], tile, columns)
 
 
-def _make_backward(absolute: bool) -> Any:
-    """Return the kernel of the gradients, or that of absolute gradients of the centers."""
+def _make_backward(depth: bool, absolute: bool) -> Any:
+    """Return the kernel of the gradients, or that of the absolute gradients of the centers."""
 
     @kernel
     def _backward(
@@ -170,7 +181,7 @@ def _make_backward(absolute: bool) -> Any:
             for p in range(PIXELS):
                 of_colors = s[_RED + p] * d[_RED + p] + s[_GREEN + p] * d[_GREEN + p] + s[_BLUE + p] * d[_BLUE + p]
                 s[_BEHIND + p] = of_colors + s[_TRANSMITTANCE + p] * d[_TRANSMITTANCE + p]
-                if absolute:
+                if depth:
                     s[_BEHIND + p] += s[_DEPTH + p] * d[_DEPTH + p]
                 s[_TRANSMITTANCE + p] = _ONE
             ended = False
@@ -184,15 +195,15 @@ def _make_backward(absolute: bool) -> Any:
                     row[:] = _ZERO
                     continue
                 polynomial = tiles.footprint(table, i, tile, columns)
-                r, g, b = table[i, 6], table[i, 7], table[i, 8]
-                to_r, to_g, to_b = _ZERO, _ZERO, _ZERO
+                r, g, b, z = table[i, 6], table[i, 7], table[i, 8], table[i, 9] if depth else _ZERO
+                to_r, to_g, to_b, to_depth = _ZERO, _ZERO, _ZERO, _ZERO
                 for p in range(PIXELS):
                     raw, now = tiles.alpha_at(polynomial, p), s[_TRANSMITTANCE + p]
                     alpha = tiles.clamped(raw)
                     weight, rest = _pass(alpha, now)
                     along = s[_RED + p] * r + s[_GREEN + p] * g + s[_BLUE + p] * b
-                    if absolute:
-                        along += s[_DEPTH + p] * table[i, 9]
+                    if depth:
+                        along += s[_DEPTH + p] * z
                     beyond = s[_BEHIND + p] - weight * along
                     s[_BEHIND + p], s[_TRANSMITTANCE + p] = beyond, rest
                     # raw (T c - B / (1 - alpha)) is the gradient of ln alpha, from which
@@ -203,11 +214,15 @@ def _make_backward(absolute: bool) -> Any:
                     to_r += weight * s[_RED + p]
                     to_g += weight * s[_GREEN + p]
                     to_b += weight * s[_BLUE + p]
+                    if depth:
+                        to_depth += weight * s[_DEPTH + p]
                 if absolute:
                     row[0], row[1] = tiles.absolute_slopes(table, i, tile, columns, s[_SLOPE:])
                 else:
                     tiles.footprint_gradient(table, i, tile, columns, s[_SLOPE:], row)
                     row[6], row[7], row[8] = to_r, to_g, to_b
+                    if depth:
+                        row[9] = to_depth
                 # Asking all pixels is not free, hence not after each splat.
                 if e % CHUNK == 0:
                     ended = _have_ended(s)
@@ -215,7 +230,8 @@ def _make_backward(absolute: bool) -> Any:
     return _backward
 
 
-_backward, _absolute = _make_backward(False), _make_backward(True)
+_backward, _backward_with_depth = _make_backward(False, False), _make_backward(True, False)
+_absolute = _make_backward(True, True)
 
 
 def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
@@ -229,13 +245,16 @@ def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tu
 
 
 class _Composite(torch.autograd.Function):
-    """Transmittance of all splats (1, H, W), and image over the background (3, H, W)."""
+    """Transmittance of all splats (1, H, W), and the image over the background, whose fourth channel is depth."""
 
     @staticmethod
-    def forward(ctx: Any, splats: Splats, background: Tensor, *_differentiable: Tensor) -> tuple[Tensor, Tensor]:
-        table, ctx.lists = tiles.make_table(splats), splats.lists
-        transmittance, image = (tiles.whole_tiles(ctx.lists, channels) for channels in (1, 3))
-        tiles.over_tiles(_forward, ctx.lists, table, background, transmittance, image)
+    def forward(
+        ctx: Any, splats: Splats, background: Tensor, depth: bool, *_differentiable: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        table, ctx.lists = tiles.make_table(splats, splats.projection.depths[:, None] if depth else None), splats.lists
+        transmittance, image = (tiles.whole_tiles(ctx.lists, channels) for channels in (1, 3 + depth))
+        kernel = _forward_with_depth if depth else _forward
+        tiles.over_tiles(kernel, ctx.lists, table, background, transmittance, image)
         ctx.save_for_backward(table, transmittance, image)
         return ctx.lists.cut(transmittance), ctx.lists.cut(image)
 
@@ -244,23 +263,22 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, to_transmittance: Tensor, to_image: Tensor) -> tuple[Tensor | None, ...]:
         table, transmittance, image = ctx.saved_tensors
         upstream = ctx.lists.padded(to_transmittance), ctx.lists.padded(to_image)
-        rows = table.new_empty(ctx.lists.gaussians.shape[0], 9)
-        tiles.over_tiles(_backward, ctx.lists, ctx.lists.slots, table, transmittance, image, *upstream, rows)
-        to_background = (upstream[1] * transmittance).sum((1, 2)) if ctx.needs_input_grad[1] else None
-        return None, to_background, *tiles.sum_rows(rows, table, ctx.lists)[:4]
+        rows, depth = table.new_empty(ctx.lists.gaussians.shape[0], table.shape[1]), len(image) == 4
+        kernel = _backward_with_depth if depth else _backward
+        tiles.over_tiles(kernel, ctx.lists, ctx.lists.slots, table, transmittance, image, *upstream, rows)
+        to_background = (upstream[1][:3] * transmittance).sum((1, 2)) if ctx.needs_input_grad[1] else None
+        *sums, to_depths = tiles.sum_rows(rows, table, ctx.lists)
+        return None, to_background, None, *sums, to_depths[:, 0] if depth else None
 
 
 def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Composite front to back, see `Engine.composite`; depth is the red of a second image."""
+    """Composite front to back, see `Engine.composite`."""
     p = splats.projection
     transmittance, image = _Composite.apply(  # type: ignore[no-untyped-call]
-        splats, background, p.means, p.factors, splats.opacities, splats.colors
+        splats, background, depth, p.means, p.factors, splats.opacities, splats.colors, p.depths
     )
-    if not depth:
-        return image, 1 - transmittance[0], None
-    red = torch.nn.functional.pad(p.depths[:, None], (0, 2))
-    depths, _, _ = composite(splats._replace(colors=red), torch.zeros_like(background), depth=False)
-    return image, 1 - transmittance[0], depths[0]
+    alpha = 1 - transmittance[0]
+    return (image[:3], alpha, image[3]) if depth else (image, alpha, None)
 
 
 def absolute_gradients(splats: Splats, rendered: Tensor, gradient: Tensor) -> Tensor:
