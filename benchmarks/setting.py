@@ -71,6 +71,7 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "random background": ("random_background", True),
     "warp": ("loss", "warp("),
     "hidden left out": ("loss", "hidden="),
+    "every second step": ("loss", "every=2"),
     "no smoothness": ("loss", "smooth=0.0"),
     "depth of the points": ("loss", "pearson("),
     "flat": ("loss", "flat("),

@@ -200,6 +200,7 @@ class Warp(WeightedTerm):
             them, so that the unit of length does not matter. Where all cameras are in one place the term is left out.
         hidden: largest difference between the depth of the step's render and that of the shifted one, warped back, as a
             share of the former, above 0; what differs more is hidden. None takes nothing for hidden.
+        every: steps from one with the term to the next.
     """
 
     needs = frozenset({"depth"})
@@ -211,13 +212,15 @@ class Warp(WeightedTerm):
         smooth: float = 0.05,
         relative: bool = False,
         hidden: float | None = None,
+        every: int = 1,
     ) -> None:
         super().__init__(weight)
+        check_count(every, "every", minimum=1)
         for name, value in (("shift", shift), ("hidden", hidden)):
             if value is not None and not value > 0:
                 raise ValueError(f"{name} must be positive, got {value}.")
         check_finite(smooth, "smooth", minimum=0)
-        self.shift, self.smooth, self.relative, self.hidden = shift, smooth, relative, hidden
+        self.shift, self.smooth, self.relative, self.hidden, self.every = shift, smooth, relative, hidden, every
         self._unit = 1.0  # of shifts, in the world's
 
     def begin(self, scene: Scene) -> None:
@@ -228,8 +231,8 @@ class Warp(WeightedTerm):
             self._unit = squares.sqrt().mean().item()
 
     def acts(self, number: int) -> bool:
-        """Return whether the weight at this step is not 0, and there is a shift."""
-        return self._unit > 0 and super().acts(number)
+        """Return whether the step is one of those with the term, its weight is not 0, and there is a shift."""
+        return number % self.every == 0 and self._unit > 0 and super().acts(number)
 
     def value(self, step: Step) -> Tensor:
         """Render the shifted camera and compare."""
