@@ -1,6 +1,7 @@
 """The setting for few photographs: candidates by held-out views, the chosen one judged; see benchmarks/setting.md.
 
     python -m benchmarks.setting measure RUN... --out setting.json    # folders of runs; what is measured is kept
+    python -m benchmarks.setting shared REFERENCE RUN... --out setting.json    # of one scene; their rows are there
     python -m benchmarks.setting table setting.json
 
 A row is a training: PSNR of held-out views of training kind, which alone choose, and what `ca-reg train` has measured
@@ -28,6 +29,7 @@ from benchmarks.paper.rows import Rows, value
 from benchmarks.paper.scenes import SCENES
 from benchmarks.remedy import held_out
 from benchmarks.start_scenes import SIFT
+from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.lpips import LPIPS, load_lpips
 from reference_trainer.evaluation.metrics import on_white
 from reference_trainer.evaluation.results import write_json
@@ -36,6 +38,7 @@ from reference_trainer.json_files import read_json
 from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.scene import View
 from reference_trainer.training.config import TrainConfig
 
 __all__ = [
@@ -45,6 +48,7 @@ __all__ = [
     "controls",
     "differences",
     "failures",
+    "fifth",
     "fourth",
     "judging",
     "main",
@@ -52,12 +56,14 @@ __all__ = [
     "recommended",
     "rows_of",
     "second",
+    "shared_views",
     "starts",
     "tables",
 ]
 
 Row = dict[str, Any]
-"""``scene``, ``candidate`` and ``seed``, ``held-out`` PSNR if there are such views, ``test`` figures, ``gaussians``."""
+"""``scene``, ``candidate`` and ``seed``, ``held-out`` PSNR if there are such views, ``shared`` PSNR, of their pixels
+that two training photographs show, ``test`` figures, ``gaussians``."""
 
 _SECOND: dict[str, tuple[str, Any]] = {
     "until 2,000": ("densify_until", 2_000),
@@ -114,7 +120,7 @@ _REFERENCES: dict[str, dict[str, Any]] = {
 
 
 def main(
-    what: Annotated[Literal["measure", "table"], tyro.conf.Positional],
+    what: Annotated[Literal["measure", "shared", "table"], tyro.conf.Positional],
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
     out: Path = Path("runs/setting.json"),
     lpips: Path | None = None,
@@ -122,8 +128,8 @@ def main(
     """Measure runs, or print the tables of what was measured.
 
     Args:
-        what: "measure", or "table".
-        paths: folders of runs, or one file of rows.
+        what: "measure"; "shared", for the pixels that two training photographs share; or "table".
+        paths: folders of runs, for "shared" first the one whose depth tells these pixels; or one file of rows.
         out: the file of rows, which is continued.
         lpips: weights of the perceptual metric, for runs that were trained without.
     """
@@ -136,6 +142,14 @@ def main(
             if (_scene(options), candidate(config), config.seed) not in known:
                 rows.append(measured(run, load_lpips(lpips)))
                 write_json(out, rows)
+    elif what == "shared":
+        rows = json.loads(out.read_text("utf-8"))
+        views = shared_views(paths[0])
+        for run in paths[1:]:
+            options, config = read_run_settings(run / "config.json")
+            (row,) = (x for x in rows_of(rows, _scene(options), candidate(config)).values() if x["seed"] == config.seed)
+            row["shared"] = fmean(quality(load_run_model(run)[0], view) for view in views)
+            write_json(out, rows)
     else:
         rows = json.loads(paths[0].read_text("utf-8"))
     print(*tables(rows), sep="\n\n")
@@ -154,6 +168,8 @@ def tables(rows: Sequence[Row]) -> list[str]:
         starts(rows),
         third(rows),
         fourth(rows),
+        fifth(rows),
+        fifth(rows, range(FEWEST)),
         failures(rows),
     ]
 
@@ -187,8 +203,7 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
     name = Path(options.path).name
     row: Row = {"scene": _scene(options), "candidate": candidate(config), "seed": config.seed}
     if name in HELD_OUT and row["candidate"].removesuffix(f", {LATER}") not in _REFERENCES:
-        others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(name, ())]
-        row["held-out"] = fmean(quality(model, view) for view in others)
+        row["held-out"] = fmean(quality(model, view) for view in _held_out(options, config.seed))
     test, metric = results["mean"]["test"], results.get("perceptual_metric")
     if metric is None and perceptual is not None:
         shown = [
@@ -200,6 +215,26 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
             "cpu": results["machine"]["cpu"]}  # fmt: skip
     print(scene.name, row["candidate"], row["seed"], row.get("held-out"), row["test"], flush=True)
     return row
+
+
+def shared_views(run: Path) -> list[View]:
+    """Return the held-out views of a run's scene, whose masks leave the pixels that training photographs share.
+
+    These are the pixels whose surface, by the depth of the run's model, at least two training photographs show.
+    """
+    model, scene = load_run_model(run)
+    options, config = read_run_settings(run / "config.json")
+    maps, views = ErrorMaps(model, scene.train), list[View]()
+    for view in _held_out(options, config.seed):
+        seen = (maps.support(view) >= 2).to(view.image)
+        views.append(dataclasses.replace(view, mask=seen if view.mask is None else seen * view.mask))
+    return views
+
+
+def _held_out(options: SceneOptions, seed: int) -> list[View]:
+    """Return the held-out views of a scene, without those of another exposure."""
+    others = OTHER_EXPOSURE.get(Path(options.path).name, ())
+    return [view for view in held_out(options, seed).test if view.name not in others]
 
 
 def choosing(rows: Sequence[Row]) -> str:
@@ -252,28 +287,47 @@ def fourth(rows: Sequence[Row]) -> str:
     return _gains(rows, (*warps, "depth of the points"), seeds=range(FEWEST))
 
 
-def _gains(rows: Sequence[Row], names: Sequence[str], *, seeds: Iterable[int]) -> str:
+def fifth(rows: Sequence[Row], own: Sequence[int] = (0,)) -> str:
+    """Return the table of the fifth choice: gains at shared pixels over the mean of the recipe's seeds 3 to 5."""
+    warps = ("warp + hidden left out", "warp + hidden left out + every second step")
+    return _gains(rows, warps, seeds=range(3, 6), own=own, figure="shared")
+
+
+def _gains(
+    rows: Sequence[Row],
+    names: Sequence[str],
+    *,
+    seeds: Iterable[int],
+    own: Sequence[int] = (0,),
+    figure: Literal["held-out", "shared"] = "held-out",
+) -> str:
     """Return a table of what candidates gain with the dense start: at held-out / test views, and Gaussians.
 
     Args:
         rows: all of them.
-        names: of what the candidates add to the recipe; their seed is 0.
+        names: of what the candidates add to the recipe.
         seeds: of the recipe's trainings over whose mean they gain.
+        own: the seeds of a candidate whose mean gains; a scene that lacks one is left out.
+        figure: whether all pixels of the held-out views count, or the shared ones.
     """
-    lines = []
+    lines, seeds = [], tuple(seeds)
     for name in names:
         line, gains = {"candidate": name}, list[tuple[float, float]]()
         for scene in HELD_OUT:
-            recipe, own = (rows_of(rows, _from_dense(scene), x) for x in (LATER, f"{LATER} + {name}"))
-            before = [recipe[seed] for seed in seeds if seed in recipe]
-            if before and (after := own.get(0)):
-                held_out = after["held-out"] - fmean(row["held-out"] for row in before)
-                gains.append((held_out, value(after, "test psnr") - fmean(value(row, "test psnr") for row in before)))
-                more = after["gaussians"] / fmean(row["gaussians"] for row in before)
+            recipe, found = (rows_of(rows, _from_dense(scene), x) for x in (LATER, f"{LATER} + {name}"))
+            before = [recipe[seed] for seed in seeds if figure in recipe.get(seed, ())]
+            after = [found[seed] for seed in own if figure in found.get(seed, ())]
+            if before and len(after) == len(own):
+                shown, tested = (
+                    fmean(map(of, after)) - fmean(map(of, before))
+                    for of in (lambda row: row[figure], lambda row: value(row, "test psnr"))
+                )
+                gains.append((shown, tested))
+                more = fmean(x["gaussians"] for x in after) / fmean(x["gaussians"] for x in before)
                 line[scene] = "{:+.2f} / {:+.2f}, {:.2f}".format(*gains[-1], more)
         if gains:
-            means = map(fmean, zip(*gains, strict=True))
-            lines.append(line | {"mean": "{:+.2f} / {:+.2f}".format(*means), "scenes": str(len(gains))})
+            mean = map(fmean, zip(*gains, strict=True))
+            lines.append(line | {"mean": "{:+.2f} / {:+.2f}".format(*mean), "scenes": str(len(gains))})
     columns = ["candidate", *(s for s in HELD_OUT if any(s in line for line in lines)), "mean", "scenes"]
     return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 

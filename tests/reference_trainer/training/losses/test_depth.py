@@ -372,6 +372,11 @@ def test_a_relative_shift_counts_in_distances_between_cameras(take_step, three_v
         assert not relative.acts(0)
 
 
+def test_a_warp_at_every_second_step_costs_nothing_at_the_others():
+    (term,) = LOSSES.make("warp(between(1.0, 104), every=2)")
+    assert [term.acts(number) for number in range(102, 108)] == [False, False, True, False, True, False]
+
+
 def test_gradients_of_warp(assert_gradients_of_differences):
     assert_gradients_of_differences(Warp(0.7, smooth=0.2), "means", "opacity_logits", "log_scales", seed=3)
 
@@ -380,6 +385,7 @@ def test_arguments_of_warp():
     for text, message in (
         ("warp(shift=0.0)", "shift must be positive"),
         ("warp(hidden=0.0)", "hidden must be positive"),
+        ("warp(every=0)", "every must be at least 1"),
         ("warp(smooth=-1.0)", "smooth must be finite and at least 0, got -1.0"),
         ("warp(-1.0)", "weight must"),
     ):
