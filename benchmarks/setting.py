@@ -103,6 +103,7 @@ STARTS = {
     "random": "random points", "few_and_random.ply": FEW_AND_RANDOM, "dense.ply": "dense",
     "dense_and_few.ply": "dense and few", "dense_and_random.ply": "dense, few and random", "sift.ply": "SIFT",
     "dense_and_sift.ply": "dense and SIFT", "dense_and_other.ply": "dense and other",
+    "measured.ply": "measured", "dense_and_measured.ply": "dense and measured",
 }  # fmt: skip
 """Values of ``--points`` whose rows stand apart, and what they are called: files of `benchmarks.start_scenes`."""
 FAILING = ("herz-jesu", "fountain", "dtu-scan65", "sceaux")
@@ -502,7 +503,7 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
 def _scene(options: SceneOptions) -> str:
     """Return the name of a scene, with its points where these are others than the scene's own."""
     start = STARTS.get(options.points)
-    return Path(options.path).name + (f", {start}" if start else "")
+    return Path(options.path).name + (f", {start}" if start else "")  # with many photographs, the folder's name says so
 
 
 def _from_dense(scene: str) -> str:

@@ -2,6 +2,7 @@
 
     python -m benchmarks.start_scenes points ../shared/data OUT SCENE...     # OUT/SCENE with a .ply for each start
     python -m benchmarks.start_scenes cameras ../shared/data OUT SCENE...    # OUT/SCENE-own
+    python -m benchmarks.start_scenes many ../shared/data OUT SCENE...       # OUT/SCENE-many, 14 or 16 photographs
 
 What comes of them is in benchmarks/dense_start.md and setting.md.
 """
@@ -12,6 +13,7 @@ import json
 import shutil
 import sys
 import tempfile
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,13 +26,13 @@ from torch import Tensor
 
 from benchmarks.paper.scenes import SCENES
 from reference_trainer.scenes.dense import dense_start
-from reference_trainer.scenes.load import load_scene
+from reference_trainer.scenes.load import evenly_spaced, load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.points import colmap_points, filled, random_points_in_frusta
 from reference_trainer.scenes.poses import LARGEST_SIDE, enlarge, find_poses
 from reference_trainer.scenes.scene import PointCloud
 
-__all__ = ["SIFT", "with_own_cameras", "with_points"]
+__all__ = ["MANY", "SIFT", "with_many_photographs", "with_own_cameras", "with_points"]
 
 SIFT = {
     "fern": "sparse_3views/0", "herz-jesu": "sparse_3near/0", "fountain": "sparse_3near/0",
@@ -39,6 +41,8 @@ SIFT = {
 """Points that COLMAP found in the training photographs; the other scenes are taken to have none."""
 OTHER = ("fern", "sceaux", "cape", "dtu-scan65", "dtu-scan24")
 """Scenes whose declared points are the dense cloud of another program, of 8,000 to 15,000 points."""
+MANY = {"fern": 14, "cape": 16, "dtu-scan65": 16, "dtu-scan24": 16}
+"""Scenes of more than ten photographs, and how many of them train."""
 FEW = 450
 """So many it finds where it must find the cameras as well."""
 LEAST = 20
@@ -47,11 +51,7 @@ LEAST = 20
 
 def with_points(data: Path, out: Path, name: str) -> None:
     """Write the folder of a scene with links to its files, and a point cloud for every start."""
-    folder = out / name
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in (data / name).resolve().iterdir():
-        if not (folder / path.name).exists():
-            (folder / path.name).symlink_to(path)
+    folder = _linked(data / name, out / name)
     sift = colmap_points(data / name / SIFT[name]) if name in SIFT else None
     train = load_scene(replace(SCENES[name].options, path=str(data / name)), trains=False).train
     generator = torch.Generator().manual_seed(0)
@@ -78,6 +78,43 @@ def with_points(data: Path, out: Path, name: str) -> None:
     for start, cloud in clouds.items():
         write_points(folder / f"{start}.ply", cloud.positions, cloud.colors)
         print(f"{name}: {start}, {len(cloud.positions):,} points")
+
+
+def with_many_photographs(data: Path, out: Path, name: str) -> None:
+    """Write the folder of a scene of which `MANY` photographs train, with what COLMAP would find, and a dense start.
+
+    The photographs are spread evenly over those that do not test. Of the points that were found in all of them, a share
+    is taken as large as that of the photographs that train; the DTU scans have none.
+    """
+    folder = _linked(data / name, out / f"{name}-many")
+    options = replace(SCENES[name].options, path=str(data / name))
+    test = [view.name for view in load_scene(options, trains=False).test]
+    everything = load_scene(replace(options, split="auto", test="none"), trains=False).train
+    pool = [view for view in everything if view.name not in test]
+    train = [pool[i] for i in evenly_spaced(len(pool), MANY[name])]
+    (folder / "split_many.json").write_text(json.dumps({"train": [view.name for view in train], "test": test}))
+    generator, measured = torch.Generator().manual_seed(0), colmap_points(data / name / "sparse/0")
+    if measured is None:
+        measured = PointCloud(torch.empty(0, 3), torch.empty(0, 3), "none", frozenset())
+    some = torch.randperm(number := len(measured.positions), generator=generator)[
+        : number * len(train) // len(everything)
+    ]
+    measured = replace(measured, positions=measured.positions[some], colors=measured.colors[some])
+    if number:
+        write_points(folder / "measured.ply", measured.positions, measured.colors)
+    began = time.process_time()
+    both, about = dense_start(train, measured)
+    write_points(folder / "dense_and_measured.ply", both.positions, both.colors)
+    print(f"{name}: {about}; {time.process_time() - began:.0f} s")
+
+
+def _linked(source: Path, folder: Path) -> Path:
+    """Make a folder with links to what is in another one, and return it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in source.resolve().iterdir():
+        if not (folder / path.name).exists():
+            (folder / path.name).symlink_to(path)
+    return folder
 
 
 def write_points(path: Path, positions: Tensor, colors: Tensor) -> None:
@@ -176,6 +213,6 @@ def _placed(model: Any, images: Path) -> list[tuple[str, int, Any]]:
 
 
 if __name__ == "__main__":
-    make = {"points": with_points, "cameras": with_own_cameras}[sys.argv[1]]
+    make = {"points": with_points, "cameras": with_own_cameras, "many": with_many_photographs}[sys.argv[1]]
     for scene in sys.argv[4:]:
         make(Path(sys.argv[2]), Path(sys.argv[3]), scene)
