@@ -15,11 +15,11 @@ import textwrap
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
-from typing import Any
+from typing import Any, NamedTuple
 
 __all__ = [
-    "EXACT", "comparison_table", "evaluation_table", "format_mean_std", "markdown_table", "mean_std", "print_table",
-    "summary",
+    "EXACT", "QUANTITIES", "comparison_table", "evaluation_table", "format_mean_std", "markdown_table", "mean_std",
+    "print_table", "summary",
 ]  # fmt: skip
 
 EXACT = "exact CA (1e-3)"
@@ -27,33 +27,46 @@ EXACT = "exact CA (1e-3)"
 
 _ABSENT = "n/a"
 _FIGURE = re.compile(r"[-+]?\d|-?$")  # also a dash or nothing in its place
-_SHOWN: dict[str, tuple[str, int]] = {
-    "psnr": ("PSNR (dB)", 2),
-    "psnr_expected": ("expected PSNR (dB)", 1),
-    "psnr_low": ("from", 1),
-    "psnr_high": ("to (80 %)", 1),
-    "ssim": ("SSIM", 3),
-    "lpips": ("LPIPS", 3),
-    "ca_exact_half": (EXACT, 2),
-    "ca_exact": ("exact CA{at} (1e-3)", 2),
-    "ca_neutral": ("neutral CA{at} (1e-3)", 2),
-    "ca": ("CA ({renders}) (1e-3)", 2),
-    "ca_std_error": ("its std error (1e-3)", 2),
-    "visible": ("visible", 3),
-    "covered": ("covered", 3),
-    "cv": ("CV", 4),
-    "depth_abs_rel": ("depth AbsRel", 4),
-    "depth_rmse": ("depth RMSE", 4),
-    "depth_mae": ("depth MAE", 4),
-    "depth_log10": ("depth log10", 4),
-    "gaussians": ("Gaussians", 0),
-    "seconds": ("seconds", 0),
+
+
+class Quantity(NamedTuple):
+    """How a quantity is shown."""
+
+    title: str
+    decimals: int  # the same down a column
+    unit: float = 1.0
+
+    def text(self, values: Iterable[float]) -> str:
+        """Return mean and standard deviation, see `format_mean_std`."""
+        return format_mean_std(values, unit=self.unit, decimals=self.decimals)
+
+
+QUANTITIES = {
+    "psnr": Quantity("PSNR (dB)", 2),
+    "psnr_expected": Quantity("expected PSNR (dB)", 1),
+    "psnr_low": Quantity("from", 1),
+    "psnr_high": Quantity("to (80 %)", 1),
+    "ssim": Quantity("SSIM", 3),
+    "lpips": Quantity("LPIPS", 3),
+    "ca_exact_half": Quantity(EXACT, 2, 1e-3),
+    "ca_exact": Quantity("exact CA{at} (1e-3)", 2, 1e-3),
+    "ca_neutral": Quantity("neutral CA{at} (1e-3)", 2, 1e-3),
+    "ca": Quantity("CA ({renders}) (1e-3)", 2, 1e-3),
+    "ca_std_error": Quantity("its std error (1e-3)", 2, 1e-3),
+    "visible": Quantity("visible", 3),
+    "covered": Quantity("covered", 3),
+    "cv": Quantity("CV", 4),
+    "depth_abs_rel": Quantity("depth AbsRel", 4),
+    "depth_rmse": Quantity("depth RMSE", 4),
+    "depth_mae": Quantity("depth MAE", 4),
+    "depth_log10": Quantity("depth log10", 4),
+    "gaussians": Quantity("Gaussians", 0),
+    "seconds": Quantity("seconds", 0),
 }
-"""Title and decimals of every quantity, in the order of the columns; the decimals are the same down a column."""
-_NOT_EVERYWHERE = (
-    "psnr", "psnr_expected", "psnr_low", "psnr_high", "ssim", "lpips",
-    "depth_abs_rel", "depth_rmse", "depth_mae", "depth_log10",
-)  # fmt: skip
+"""By name, in the order of the columns."""
+
+_NOT_EVERYWHERE = re.compile("psnr|ssim|lpips|depth")
+"""How the names of quantities begin that need a photograph, a view that was not trained on, weights or a true depth."""
 _HIGHEST_IS_BEST = {"PSNR (dB)": True, "SSIM": True, "LPIPS": False, EXACT: False, "depth AbsRel": False}
 
 
@@ -65,16 +78,14 @@ def evaluation_table(data: Mapping[str, Any]) -> str:
     """
     rows = {f"{view['split']} {view['name']}": view for view in data["views"]}
     rows |= {f"mean {split}": mean for split, mean in data["mean"].items()}
-    absent = {
-        name
-        for name in _NOT_EVERYWHERE
-        if all(math.isnan(x) for row in rows.values() if (x := row.get(name)) is not None)
-    }
+    absent = {"gaussians", "seconds"}
+    for name in filter(_NOT_EVERYWHERE.match, QUANTITIES):
+        if all(math.isnan(x) for row in rows.values() if (x := row.get(name)) is not None):
+            absent.add(name)
     settings = data.get("ca_settings") or {}
-    rate = settings.get("drop_rate")
-    if rate == 0.5:
+    if settings.get("drop_rate") == 0.5:
         absent.add("ca_exact")  # it is the score for people
-    return _table("view", rows, [name for name in _SHOWN if name not in absent | {"gaussians", "seconds"}], settings)
+    return _table("view", rows, [name for name in QUANTITIES if name not in absent], settings)
 
 
 def summary(results: Mapping[str, Any]) -> str:
@@ -84,7 +95,7 @@ def summary(results: Mapping[str, Any]) -> str:
     names = ["psnr", "ssim", "lpips", "ca_exact_half", "cv", "gaussians", "seconds"]
     if all(row.get("lpips") is None for row in rows.values()):
         names.remove("lpips")
-    return _table("views", rows, names)
+    return _table("views", rows, names, {})
 
 
 def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
@@ -100,7 +111,7 @@ def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     if not any("test" in run["mean"] for of in runs.values() for run in of):
         exact = ["ca_exact_half"]
         shown = {"train": ["psnr", *exact], "between": exact, "around": exact}
-    columns = {f"{split} {_SHOWN[name][0]}": (split, name) for split, names in shown.items() for name in names}
+    columns = {f"{split} {QUANTITIES[name].title}": (split, name) for split, names in shown.items() for name in names}
     rows: list[dict[str, object]] = []
     for strategy, of in runs.items():
         row: dict[str, object] = {"strategy": strategy, "seeds": len(of)}
@@ -108,9 +119,9 @@ def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
             values = [run["mean"].get(split, {}).get(name) for run in of]
             if any(value is not None for value in values):
                 found = [math.nan if value is None else value for value in values]  # JSON has no nan
-                row[title] = format_mean_std(found, unit=_unit(name), decimals=_SHOWN[name][1])
+                row[title] = QUANTITIES[name].text(found)
         for name in ("gaussians", "seconds"):
-            row[_SHOWN[name][0]] = format_mean_std([run[name] for run in of], decimals=0)
+            row[QUANTITIES[name].title] = QUANTITIES[name].text([run[name] for run in of])
         rows.append(row)
     present = [title for title in columns if any(title in row for row in rows)]
     return markdown_table(rows, ["strategy", "seeds", *present, "Gaussians", "seconds"])
@@ -273,27 +284,20 @@ def _best(head: Sequence[str], rows: Sequence[Sequence[str]]) -> set[tuple[int, 
     return found
 
 
-def _table(
-    first: str, rows: Mapping[str, Mapping[str, Any]], names: Sequence[str], settings: Mapping[str, Any] | None = None
-) -> str:
+def _table(first: str, rows: Mapping[str, Mapping[str, Any]], names: Sequence[str], settings: Mapping[str, Any]) -> str:
     """Return labeled rows of quantities in their units; None and nan become n/a."""
-    settings = settings or {}
     rate = settings.get("drop_rate")
     drawn = "by its regularizer" if rate is None and settings else f"drop rate {rate:g}" if rate is not None else ""
     renders = ", ".join(filter(None, [f"{settings.get('samples') or 5} renders", drawn]))
     at = f" at {drawn}" if rate is not None else " at its own drop rate"
-    titles = {name: _SHOWN[name][0].format(at=at, renders=renders) for name in names}
+    titles = {name: QUANTITIES[name].title.format(at=at, renders=renders) for name in names}
     cells: list[dict[str, object]] = []
     for label, row in rows.items():
-        known = {name: row[name] / _unit(name) for name in names if row.get(name) is not None}
-        shown = {titles[name]: f"{x:.{_SHOWN[name][1]}f}" for name, x in known.items() if math.isfinite(x)}
-        cells.append({first: label, **shown})
+        cells.append({first: label})
+        for name, title in titles.items():
+            if (x := row.get(name)) is not None and math.isfinite(x):
+                cells[-1][title] = f"{x / QUANTITIES[name].unit:.{QUANTITIES[name].decimals}f}"
     return markdown_table(cells, [first, *titles.values()])
-
-
-def _unit(name: str) -> float:
-    """Return the unit in which a quantity is shown."""
-    return 1e-3 if name.startswith("ca") else 1.0
 
 
 def _cell(value: object) -> str:

@@ -11,37 +11,22 @@ from itertools import cycle
 from typing import Any
 
 from reference_trainer.evaluation.style import COLORS, STRATEGIES
-from reference_trainer.evaluation.tables import format_mean_std, mean_std
+from reference_trainer.evaluation.tables import QUANTITIES, mean_std
 from reference_trainer.training.config import TrainConfig
 
 __all__ = [
-    "FEWEST_SEEDS",
-    "Rows",
-    "differences",
-    "natural_name",
-    "natural_order",
-    "run_colors",
-    "score_columns",
-    "unique_names",
-    "verdict",
-]
+    "FEWEST_SEEDS", "Rows", "differences", "natural_name", "natural_order", "run_colors", "score_columns",
+    "unique_names", "verdict",
+]  # fmt: skip
 
 _USUAL = TrainConfig()
-_COLUMNS = [  # split, key, title, decimals, unit, whether the highest is best; None where neither end is a merit
-    ("test", "psnr", "PSNR (dB)", 2, 1.0, True),
-    ("test", "psnr_expected", "expected PSNR (dB)", 1, 1.0, None),
-    ("test", "ssim", "SSIM", 3, 1.0, True),
-    ("test", "lpips", "LPIPS", 3, 1.0, False),
-    ("test", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, False),
-    ("between", "psnr_expected", "expected PSNR (dB)", 1, 1.0, None),
-    ("around", "psnr_expected", "expected PSNR (dB)", 1, 1.0, None),
-    ("between", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, False),
-    ("around", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, False),
-    ("train", "psnr", "PSNR (dB)", 2, 1.0, None),
-    ("train", "ca_exact_half", "exact CA (1e-3)", 2, 1e-3, None),
-    ("", "gaussians", "Gaussians", 0, 1.0, None),
-    ("", "seconds", "seconds", 0, 1.0, None),
-]
+_COLUMNS = {
+    ("test", "psnr"): True, ("test", "psnr_expected"): None, ("test", "ssim"): True, ("test", "lpips"): False,
+    ("test", "ca_exact_half"): False, ("between", "psnr_expected"): None, ("around", "psnr_expected"): None,
+    ("between", "ca_exact_half"): False, ("around", "ca_exact_half"): False, ("train", "psnr"): None,
+    ("train", "ca_exact_half"): None, ("", "gaussians"): None, ("", "seconds"): None,
+}  # fmt: skip
+"""By split and quantity, in order: whether the highest is best; None where neither end is a merit."""
 
 FEWEST_SEEDS = 3
 """Of each of two runs, to say whether they can be told apart."""
@@ -97,33 +82,34 @@ def run_colors(configs: Sequence[TrainConfig]) -> list[str]:
 
 @dataclass(frozen=True)
 class Rows:
-    """The rows of a strategy that a verdict is made from.
-
-    Args:
-        name: of the strategy.
-        baseline: whether it is one without a regularizer.
-        results: content of ``results.json`` of each of its seeds.
-        color: that the page shows it in.
-    """
+    """The rows of a strategy that a verdict is made from."""
 
     name: str
-    baseline: bool
-    results: Sequence[Mapping[str, Any]]
-    color: str = ""
+    baseline: bool  # whether it is one without a regularizer
+    results: Sequence[Mapping[str, Any]]  # content of ``results.json`` of each of its seeds
+    color: str = ""  # that the page shows it in
 
     def values(self, split: str, key: str) -> list[float]:
         """Return a mean over the views of a split, of every seed that has it."""
         found = [(of["mean"].get(split, {}) if split else of).get(key) for of in self.results]
         return [float(x) for x in found if x is not None and math.isfinite(x)]
 
+    def mean(self, split: str, key: str) -> float:
+        """Return the mean of `values`; nan without any."""
+        return mean_std(self.values(split, key))[0]
+
+    def text(self, split: str, key: str) -> str:
+        """Return mean and standard deviation of `values` as tables show them."""
+        return QUANTITIES[key].text(self.values(split, key))
+
 
 def _difference(rows: Rows, reference: Rows, split: str, key: str) -> tuple[float, float] | None:
     """Return the difference of two means and two standard errors of it, nan with a single seed; None without values."""
-    (mean, std), (other, spread) = (mean_std(of.values(split, key)) for of in (rows, reference))
-    if math.isnan(mean) or math.isnan(other):
+    values, others = rows.values(split, key), reference.values(split, key)
+    if not values or not others:
         return None
-    counts = [len(of.values(split, key)) for of in (rows, reference)]
-    return mean - other, 2 * math.sqrt(std**2 / counts[0] + spread**2 / counts[1])
+    (mean, std), (other, spread) = mean_std(values), mean_std(others)
+    return mean - other, 2 * math.sqrt(std**2 / len(values) + spread**2 / len(others))
 
 
 def differences(first: Rows, second: Rows) -> list[dict[str, object]]:
@@ -133,9 +119,10 @@ def differences(first: Rows, second: Rows) -> list[dict[str, object]]:
     not known well enough to tell anything apart.
     """
     rows: list[dict[str, object]] = []
-    for split, key, title, decimals, unit, highest in _COLUMNS:
+    for (split, key), highest in _COLUMNS.items():
         if (found := _difference(second, first, split, key)) is None:
             continue
+        title, decimals, unit = QUANTITIES[key]
         delta, margin = (x / unit for x in found)
         known = min(len(of.values(split, key)) for of in (first, second)) >= FEWEST_SEEDS
         said = "no" if known else "unknown"
@@ -143,8 +130,8 @@ def differences(first: Rows, second: Rows) -> list[dict[str, object]]:
             said = "yes" if highest is None else "yes, better" if (delta > 0) == highest else "yes, worse"
         rows.append({
             "score": f"{split} {title}".strip(),
-            first.name: format_mean_std(first.values(split, key), unit=unit, decimals=decimals),
-            second.name: format_mean_std(second.values(split, key), unit=unit, decimals=decimals),
+            first.name: first.text(split, key),
+            second.name: second.text(split, key),
             "difference": f"{delta:+.{decimals}f}" + f" ± {margin:.{decimals}f}" * known,
             "told apart": said,
         })  # fmt: skip
@@ -160,8 +147,9 @@ def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:
     """
     columns = []
     unseen = {split for of in strategies for run in of.results for split in run["mean"]}
-    for split, key, title, decimals, unit, highest in _COLUMNS:
-        means = [mean_std(of.values(split, key))[0] / unit for of in strategies]
+    for (split, key), highest in _COLUMNS.items():
+        title, decimals, unit = QUANTITIES[key]
+        means = [of.mean(split, key) / unit for of in strategies]
         if (split and split not in unseen) or all(map(math.isnan, means)):
             continue
         rounded = [round(mean, decimals) for mean in means]
@@ -169,10 +157,10 @@ def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:
         best = None if highest is None or len(known) < 2 else max(known) if highest else min(known)
         cells: list[dict[str, Any]] = []
         for i, (of, mean) in enumerate(zip(strategies, rounded, strict=True)):
-            cell = {"text": format_mean_std(of.values(split, key), unit=unit, decimals=decimals), "best": mean == best}
+            cell = {"text": of.text(split, key), "best": mean == best}
             if key == "psnr_expected" and not math.isnan(mean):
-                ends = (mean_std(of.values(split, end))[0] for end in ("psnr_low", "psnr_high"))
-                cell["interval"] = " to ".join(f"{end:.{decimals}f}" for end in ends)
+                low, high = of.mean(split, "psnr_low"), of.mean(split, "psnr_high")
+                cell["interval"] = f"{low:.{decimals}f} to {high:.{decimals}f}"
             if i and highest is not None and math.isfinite(delta := mean - rounded[0]):
                 cell["delta"] = f"{delta:+.{decimals}f}".replace("-", "\N{MINUS SIGN}")
                 cell["better"] = None if not round(delta, decimals) else (delta > 0) == highest
@@ -184,12 +172,9 @@ def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:
 def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str, list[str]]:
     """Return one sentence on what the rows show, and its evidence: the other strategies, the rule, what limits it.
 
-    Strategies are compared with the first. Two means are told apart if their difference exceeds two of its standard
-    errors, by the spread over seeds; with one seed no spread is known, and the evidence says so.
-
-    Args:
-        strategies: with scores, the reference first.
-        other: settings, next to the regularizers, that differ between the runs.
+    Strategies, which have scores, are compared with the first. Two means are told apart if their difference exceeds two
+    of its standard errors, by the spread over seeds; with one seed no spread is known, and the evidence says so, as it
+    does if ``other`` settings than the regularizers differ between the runs.
     """
     if not strategies:
         return "No verdict: no run has been trained to its end.", []
@@ -203,14 +188,14 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
         where = "each on its own test views" if all(tested) else where
         limits += ["The runs were not tested on the same views, so their scores on them cannot be compared."]
     if not rest:
-        psnr, ca = (mean_std(reference.values(split, key))[0] for key in ("psnr", "ca_exact_half"))
+        psnr, ca = (reference.mean(split, key) for key in ("psnr", "ca_exact_half"))
         found = [f"PSNR {psnr:.2f} dB"] * math.isfinite(psnr) + [f"exact CA {ca * 1e3:.2f}e-3"] * math.isfinite(ca)
         text = f"{reference.name}: {' and '.join(found) or 'nothing was measured'} {where}."
         return text, [*limits, "Nothing stands beside it: add a second run to compare it with."]
     said = [_said(rows, reference, split) for rows in rest]
     sign, key = (1, "psnr") if split == "test" else (-1, "ca_exact_half")
     measured = [i for i, rows in enumerate(rest) if rows.values(split, key)] or [0]
-    best = max(measured, key=lambda i: sign * mean_std(rest[i].values(split, key))[0])
+    best = max(measured, key=lambda i: sign * rest[i].mean(split, key))
     merit = "highest PSNR" if split == "test" else "least co-adaptation"
     differs, than = said[best]
     text = f"{rest[best].name}{f' (the {merit} of {len(rest)})' * (len(rest) > 1)}: "
@@ -237,20 +222,18 @@ def _said(rows: Rows, reference: Rows, split: str) -> tuple[str, str]:
     """
     parts = []
     if split == "test" and (found := _difference(rows, reference, split, "psnr")):
-        delta, margin = found
-        size = f"{abs(delta):.2f}"
-        parts.append(_part("PSNR", size, f" dB {'higher' if delta > 0 else 'lower'}", told=not abs(delta) <= margin))
+        parts.append(_part("PSNR", found, f"{abs(found[0]):.2f} dB", ("lower", "higher")))
     if found := _difference(rows, reference, split, "ca_exact_half"):
-        delta, margin = found
-        usual = mean_std(reference.values(split, "ca_exact_half"))[0]
-        size, unit = (f"{100 * abs(delta) / usual:.0f}", " %") if usual else (f"{abs(delta) * 1e3:.2f}", "e-3")
-        how = f"{unit} {'more' if delta > 0 else 'less'}"
-        parts.append(_part("co-adaptation", size, how, told=not abs(delta) <= margin))
+        delta, usual = abs(found[0]), reference.mean(split, "ca_exact_half")
+        size = f"{100 * delta / usual:.0f} %" if usual else f"{delta * 1e3:.2f}e-3"
+        parts.append(_part("co-adaptation", found, size, ("less", "more")))
     return " and ".join(text for text, _ in parts), parts[-1][1] if parts else ""
 
 
-def _part(score: str, size: str, how: str, *, told: bool) -> tuple[str, str]:
-    """Return a difference in one score, and the word that follows it; ``told`` says whether it can be told."""
-    if not told:
-        return f"a {score} that cannot be told apart ({size}{how})", "from"
-    return (f"{size}{how} {score}", "than") if float(size) else (f"the same {score}", "as")
+def _part(score: str, found: tuple[float, float], size: str, words: tuple[str, str]) -> tuple[str, str]:
+    """Return a difference in one score, of this size and in this direction, and the word that follows it."""
+    delta, margin = found
+    text = f"{size} {words[delta > 0]}"
+    if abs(delta) <= margin:  # nan with a single seed
+        return f"a {score} that cannot be told apart ({text})", "from"
+    return (f"{text} {score}", "than") if float(size.split()[0]) else (f"the same {score}", "as")
