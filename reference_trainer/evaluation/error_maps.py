@@ -16,7 +16,7 @@ from reference_trainer.render.renderer import rasterize, render_moments
 from reference_trainer.render.splats import Rendering
 from reference_trainer.scenes.scene import View, Viewpoint
 
-__all__ = ["ErrorMaps", "error_map"]
+__all__ = ["ErrorMaps"]
 
 AGREEMENT = 0.05
 """Relative difference of depths up to which a photograph and a view are taken to see the same surface: wider than the
@@ -37,11 +37,7 @@ class ErrorMaps:
     depth, and what they differ by, over what the sum of features expects there, is the unit of the maps.
 
     For each training view this takes what a map takes, and a render; for each view two renders, a pass of moments, and
-    the warps.
-
-    Args:
-        model: which, on the views' device.
-        train: its training views; without any, the maps come from the model alone.
+    the warps. Without training views the maps come from the model alone.
 
     Example:
         >>> from reference_trainer.model.gaussians import Gaussians
@@ -54,16 +50,14 @@ class ErrorMaps:
 
     @torch.no_grad()
     def __init__(self, model: TrainedModel, train: Sequence[View] = ()) -> None:
-        self.model = model
+        self.model, self.unit = model, 1.0
         self._photographs: list[tuple[Camera, Tensor]] = []  # with depth in a fourth channel
-        self._train, self.unit = [view.to(model.background.device) for view in train], 1.0
-        if not train:
-            return
+        self._train = [view.to(model.background.device) for view in train]
         for view in self._train:
             depth = _depth(model.test_rendering(view, depth=True))
             self._photographs.append((view.camera, torch.cat([view.image, depth[None]])))
         measured = expected = 0.0
-        for number in range(0, len(train), -(-len(train) // NEAREST)):
+        for number in range(0, len(train), -(-len(train) // NEAREST) or 1):
             difference, features = self.left_out(number)
             shown = features["hidden"] == 0
             measured += difference.sum().item()
@@ -140,11 +134,6 @@ class ErrorMaps:
             support += same
         found = support > 0
         return {"warp": torch.where(found, least, 0.0), "hidden": (~found).to(depth), "support": support}
-
-
-def error_map(model: TrainedModel, view: Viewpoint, train: Sequence[View] = ()) -> ErrorMap:
-    """Expect the error of one view; for several views of a model, keep an `ErrorMaps`."""
-    return ErrorMaps(model, train)(view)
 
 
 def _depth(out: Rendering) -> Tensor:

@@ -16,17 +16,9 @@ from torch import Tensor
 
 from ca_reg import CAResult, CAScore, attribute
 from ca_reg.error_maps import ErrorMap
-from reference_trainer.evaluation.error_maps import ErrorMaps, error_map
+from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.lpips import LPIPS
-from reference_trainer.evaluation.metrics import (
-    DepthErrors,
-    color_variance_map,
-    counted,
-    depth_errors,
-    on_white,
-    psnr,
-    ssim,
-)
+from reference_trainer.evaluation.metrics import color_variance_map, counted, depth_errors, on_white, psnr, ssim
 from reference_trainer.evaluation.pictures import PANEL, file_names, heat_map, save_png, side_by_side
 from reference_trainer.evaluation.results import ResultStore, machine
 from reference_trainer.evaluation.trained_model import MaskedRenders, TrainedModel
@@ -45,22 +37,12 @@ ERROR_PICTURE_RANGE = 0.25
 """Absolute error, averaged over channels, that maps to the brightest color."""
 
 
-_EXPECTED = "psnr_expected", "psnr_low", "psnr_high"
-
-
 @dataclass(frozen=True)
 class ViewScores:
     """What was measured at one view; nan where a quantity does not exist, such as ``psnr`` without a photograph.
 
-    ``ca`` follows the paper's protocol; ``ca_half`` does so at drop rate 0.5 for every model, which compares models of
-    different dropout rates on equal terms. ``ca_exact`` is the limit for infinitely many samples, at the drop rate of
-    ``ca`` and over the pixels whose expected alpha is above 0.8; ``ca_exact_half`` the same at drop rate 0.5;
-    ``ca_neutral`` is ``ca_exact`` with every pixel composited on its own expected color, so that the background does
-    not count. ``visible`` is the share of pixels that ``ca`` covers, ``covered`` the mean alpha of the test-time image.
-    ``depth_abs_rel`` to ``depth_log10`` are the `DepthErrors` of the test-time image where the true depth is known.
-    ``ca_reason`` is the name of the `Reason` why ``ca`` has its value, or is nan. ``psnr_expected`` is what an
-    `ErrorMap` expects without the photograph, of views that the model was not trained on, and in 80 % of the cases the
-    PSNR is between ``psnr_low`` and ``psnr_high``.
+    The exact scores are limits for infinitely many samples, over the pixels whose expected alpha is above 0.8. Those at
+    drop rate 1/2 compare models of different dropout rates on equal terms.
     """
 
     name: str
@@ -68,23 +50,23 @@ class ViewScores:
     psnr: float
     ssim: float
     lpips: float
-    ca: float
+    ca: float  # of the paper's protocol
     ca_std_error: float
-    ca_half: float
-    ca_exact: float
-    ca_exact_half: float
-    ca_neutral: float
-    visible: float
-    covered: float
-    cv: float
-    depth_abs_rel: float = math.nan
+    ca_half: float  # the same at drop rate 1/2
+    ca_exact: float  # at the drop rate of ``ca``
+    ca_exact_half: float  # at drop rate 1/2
+    ca_neutral: float  # ``ca_exact`` with every pixel on its own expected color, so that the background does not count
+    visible: float  # share of pixels that ``ca`` covers
+    covered: float  # mean alpha of the test-time image
+    cv: float  # mean of `color_variance_map`
+    depth_abs_rel: float = math.nan  # this and the next are the `DepthErrors` of the test-time image
     depth_rmse: float = math.nan
     depth_mae: float = math.nan
     depth_log10: float = math.nan
-    ca_reason: str = ""
-    psnr_expected: float = math.nan
-    psnr_low: float = math.nan
-    psnr_high: float = math.nan
+    ca_reason: str = ""  # name of the `Reason` why ``ca`` has its value, or is nan
+    psnr_expected: float = math.nan  # by an `ErrorMap`, without the photograph, of views that were not trained on
+    psnr_low: float = math.nan  # in 80 % of the cases the PSNR is between this
+    psnr_high: float = math.nan  # and this
 
 
 @dataclass(frozen=True)
@@ -150,9 +132,6 @@ def evaluate(
         partial: file for the scores of finished views, see `ResultStore`: an interrupted evaluation continues with the
             next view. The caller removes it once the result is written.
         on_view: called before each view is measured.
-
-    Returns:
-        Scores per view and their means.
     """
     renders = MaskedRenders(model)
     scores = (
@@ -199,30 +178,29 @@ def _measure(
     files: Sequence[Path],
 ) -> ViewScores:
     """Measure one view, and write its render and its panel if ``files`` names them."""
-    opacities = model.gaussians.opacities
-    truth = view.depth if isinstance(view, View) else None
+    photograph, mask, truth = (view.image, view.mask, view.depth) if isinstance(view, View) else (None, None, None)
     out = model.test_rendering(view, depth=truth is not None)
-    image, photograph = out.image.clamp(0, 1), view.image if isinstance(view, View) else None
-    quality, depth = (math.nan,) * 3, DepthErrors()
+    image, quality = out.image.clamp(0, 1), dict.fromkeys(("psnr", "ssim", "lpips"), math.nan)
+    if photograph is not None and counted(photograph, mask).numel():
+        pair = on_white(image, mask), on_white(photograph, mask)
+        quality |= {"psnr": psnr(image, photograph, mask), "ssim": ssim(*pair)}
+        quality |= {} if perceptual is None else {"lpips": perceptual(*pair)}
     if truth is not None and out.depth is not None:
-        depth = depth_errors(out.depth / out.alpha.clamp_min(1e-6), truth)
-    if isinstance(view, View) and counted(view.image, view.mask).numel():
-        pair = on_white(image, view.mask), on_white(view.image, view.mask)
-        quality = psnr(image, view.image, view.mask), ssim(*pair), math.nan if perceptual is None else perceptual(*pair)
+        errors_of_depth = depth_errors(out.depth / out.alpha.clamp_min(1e-6), truth)
+        quality |= {f"depth_{name}": error for name, error in errors_of_depth._asdict().items()}
+    expected = errors(view, mask) if errors is not None and split != "train" else None
+    if expected is not None:
+        low, high = expected.interval
+        quality |= {"psnr_expected": expected.psnr, "psnr_low": low, "psnr_high": high}
     found: dict[Any, CAResult] = {}
     for score in scores:  # some coincide for models trained without dropout, whose drop rate is 1/2 anyway
         if score.settings not in found:
-            found[score.settings] = score(opacities, view, index=index)
+            found[score.settings] = score(model.gaussians.opacities, view, index=index)
     ca, half, exact, exact_half, neutral = (found[score.settings] for score in scores)
     variance, covered = color_variance_map(out.splats)
-    mask = view.mask if isinstance(view, View) else None
-    expected = errors(view, mask) if errors is not None and split != "train" else None
     measured = ViewScores(
         name=view.name,
         split=split,
-        psnr=quality[0],
-        ssim=quality[1],
-        lpips=quality[2],
         ca=ca.value,
         ca_std_error=ca.std_error,
         ca_half=half.value,
@@ -232,45 +210,48 @@ def _measure(
         visible=ca.visible.double().mean().item(),
         covered=out.alpha.double().mean().item(),
         cv=variance[covered].double().mean().item() if bool(covered.any()) else math.nan,
-        **{f"depth_{name}": error for name, error in depth._asdict().items()},
         ca_reason=ca.reason.name,
-        **{} if expected is None else dict(zip(_EXPECTED, (expected.psnr, *expected.interval), strict=True)),
+        **quality,
     )
     if files:
-        bar, found = ("0", f"{ERROR_PICTURE_RANGE:g}"), {"exact CA": exact_half}
-        guessed = {}
-        if expected is not None:
-            guessed = {_titled("expected error", expected.psnr, "{:.1f} dB"): (expected_error_picture(expected), bar)}
-        title = _titled("render", measured.psnr, "{:.2f} dB")
-        panels: dict[str, tuple[Tensor, tuple[str, str] | None]] = {title: (image, None)}
-        if photograph is None:
-            if scores[2].settings != scores[3].settings:
-                found[f"exact CA{_at(exact)}"] = exact
-            found |= {f"CA, {ca.samples} renders{_at(ca)}": ca, f"neutral CA{_at(neutral)}": neutral}
+        maps = {"exact CA": exact_half}
+        of_errors, of_ca = (("0", f"{end:g}") for end in (ERROR_PICTURE_RANGE, CA_PICTURE_RANGE))
+        panels: list[tuple[str, Tensor, tuple[str, str] | None]]  # title, picture, ends of its color bar
+        panels = [(_titled("render", measured.psnr, "{:.2f} dB"), image, None)]
+        if photograph is not None:
+            error = "error", error_picture(image, photograph), of_errors
+            panels = [("photograph", photograph, None), *panels, error]
         else:
-            panels = {"photograph": (photograph, None)} | panels | {"error": (error_picture(image, photograph), bar)}
-        panels |= guessed | _maps(found)
+            if exact is not exact_half:
+                maps[f"exact CA{_at(exact)}"] = exact
+            maps |= {f"CA, {ca.samples} renders{_at(ca)}": ca, f"neutral CA{_at(neutral)}": neutral}
+        if expected is not None:
+            title = _titled("expected error", expected.psnr, "{:.1f} dB")
+            panels.append((title, expected_error_picture(expected), of_errors))
+        panels += [(_titled(name, x.value * 1e3, "{:.2f}e-3"), ca_picture(x), of_ca) for name, x in maps.items()]
+        titles, pictures, scales = zip(*panels, strict=True)
         save_png(files[0], image)
-        pictures, scales = zip(*panels.values(), strict=True)
-        save_png(files[1], side_by_side(pictures, [*panels], scales=scales))
+        save_png(files[1], side_by_side(pictures, titles, scales=scales))
     return measured
 
 
 @torch.no_grad()
 def training_snapshot(model: TrainedModel, view: View) -> dict[str, Tensor]:
-    """Return what is worth watching while a model trains: pictures of a view, and the shares of the exact score.
+    """Return what is worth watching while a model trains: pictures of a view (3, H, W), and shares of the exact score.
 
-    Returns:
-        ``"render"``, ``"error"``, ``"expected error"`` (by the model alone: the photographs would take four times
-        as long as the rest) and ``"co-adaptation"``, (3, H, W), and ``"log10 of share"`` of the Gaussians that
-        have a share; the last two at drop rate 1/2.
+    Co-adaptation and shares, of the Gaussians that have one, are at drop rate 1/2.
     """
     image = model.test_rendering(view).image.clamp(0, 1)
     score = model.exact_ca_score(drop_rate=0.5)
     shares, result = attribute(score, model.shares, model.gaussians.opacities, view)
-    pictures = {"render": image, "error": error_picture(image, view.image), "co-adaptation": ca_picture(result)}
-    pictures["expected error"] = expected_error_picture(error_map(model, view))
-    return pictures | {"log10 of share": shares[shares > 0].log10()}
+    return {
+        "render": image,
+        "error": error_picture(image, view.image),
+        "co-adaptation": ca_picture(result),
+        # By the model alone: the photographs would take four times as long as the rest.
+        "expected error": expected_error_picture(ErrorMaps(model)(view)),
+        "log10 of share": shares[shares > 0].log10(),
+    }
 
 
 def _at(result: CAResult) -> str:
@@ -281,12 +262,6 @@ def _at(result: CAResult) -> str:
 def _titled(name: str, value: float, form: str) -> str:
     """Return the title of a picture with its value, if it has one."""
     return name if math.isnan(value) else f"{name} {form.format(value)}"
-
-
-def _maps(results: Mapping[str, CAResult]) -> dict[str, tuple[Tensor, tuple[str, str] | None]]:
-    """Return the maps of scores with the ends of their color bars, titled with name and value."""
-    ends = "0", f"{CA_PICTURE_RANGE:g}"
-    return {_titled(name, of.value * 1e3, "{:.2f}e-3"): (ca_picture(of), ends) for name, of in results.items()}
 
 
 def ca_picture(result: CAResult) -> Tensor:

@@ -16,15 +16,8 @@ from ca_reg.types import MomentsFn, RenderFn
 from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import arguments, render_gaussians
-from reference_trainer.render import (
-    MomentImages,
-    Rendering,
-    Splats,
-    render_masks,
-    render_moments,
-    splat,
-    variance_shares,
-)
+from reference_trainer.render import render_masks, render_moments, splat, variance_shares
+from reference_trainer.render.splats import MomentImages, Rendering, Splats
 from reference_trainer.scenes.scene import Viewpoint
 
 __all__ = ["MaskedRenders", "TrainedModel"]

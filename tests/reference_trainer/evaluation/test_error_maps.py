@@ -8,7 +8,7 @@ import torch
 
 from ca_reg.functional import Multiplier
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.error_maps import ErrorMaps, error_map
+from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.metrics import color_variance_map
 from reference_trainer.evaluation.trained_model import TrainedModel
@@ -125,10 +125,7 @@ def test_photographs_that_contradict_each_other_raise_the_unit_in_proportion(pla
         return ErrorMaps(plane, shown).unit
 
     assert unit(0.2) > 1.5 * unit(0.02) > 0
-    view, train = Viewpoint("new", camera_at(0.1)), [photograph("a", -0.2), photograph("b", 0.3)]
-    maps = ErrorMaps(plane, train)
-    torch.testing.assert_close(error_map(plane, view, train).error, maps(view).error)
-    assert ErrorMaps(plane, train[:1]).unit == 1  # nothing to compare with
+    assert ErrorMaps(plane, [photograph("a", -0.2)]).unit == 1  # nothing to compare with
 
 
 def test_a_photograph_that_is_left_out_is_not_seen(plane):

@@ -8,7 +8,7 @@ import torch
 from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise
 from ca_reg.functional import Multiplier
 from reference_trainer.camera import Camera
-from reference_trainer.evaluation.error_maps import error_map
+from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.evaluate import CA_PICTURE_RANGE
 from reference_trainer.evaluation.pictures import heat_map
 from reference_trainer.evaluation.shares import Heat, blend_weights, colored_by, mean_shares
@@ -47,7 +47,7 @@ def test_the_expected_error_is_told_by_the_training_photographs(model):
     photograph = View("v", CAMERA, drawn_with(model, 0.5 * model.gaussians.opacities))
     shown = ViewerModel(model, [Viewpoint("", CAMERA)], train=[photograph])
     image, note, scale = shown.render(DisplayOptions("expected error"), CAMERA)
-    found = error_map(model, Viewpoint("", CAMERA), [photograph])
+    found = ErrorMaps(model, [photograph])(Viewpoint("", CAMERA))
     torch.testing.assert_close(image, heat_map(found.error, float(scale[1])))
     assert f"expected {found.psnr:.1f} dB" in note
     alone = ViewerModel(model, []).render(DisplayOptions("expected error"), CAMERA)
