@@ -11,6 +11,7 @@ import shlex
 from collections import Counter
 from collections.abc import Collection, Sequence
 from datetime import datetime
+from html import escape
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -77,20 +78,17 @@ def write_report(
     against the step, every model in 3D (all turn together) in its colors or its co-adaptation heat, any two of
     photograph, render, error, expected error and CA map of all runs upon each other, the views that nobody took of
     which least is expected, what hangs there, and how concentrated the score is on few Gaussians. Runs come in the
-    order baseline, dropout, noise, both, under natural names. The heat is the share of the
-    exact score at drop rate 1/2 per blend weight, over the views of the page, on one logarithmic scale for all runs
-    around the mean of the first run that has one. What a run lacks is left out, and the page says so.
+    order baseline, dropout, noise, both, under natural names. The heat is the share of the exact score at drop rate 1/2
+    per blend weight, over the views of the page, on one logarithmic scale for all runs around the mean of the first run
+    that has one. What a run lacks is left out, and the page says so.
 
     Args:
         runs: their folders, finished or not; the folder of a comparison stands for the first seed of each strategy, and
             its scores are those of all seeds.
-        out: the file; by default ``report.html`` in the folder of the run, or in the deepest folder common to all.
+        out: the file; by default and in the result that of `report_file`.
         views: how many views of each split are shown and measured, evenly spaced.
         device: where to render.
         trust: as for `load_run`.
-
-    Returns:
-        The file.
 
     Raises:
         ValueError: if there is no run, one is given twice, their scenes differ, a file is damaged, ``out`` is a folder
@@ -118,10 +116,9 @@ def write_report(
     data = _data(dict(zip(names, runs, strict=True)), found, whole=set(runs) - set(folders))
     command = ["ca-reg", "report", *map(str, folders)]
     command += ["--views", str(views)] * (views != VIEWS) + ["--trust", *sorted(trust)] * bool(trust)
-    made = f"{shlex.join(command)} · ca_reg {ca_reg.__version__} · "
-    data["made"] = made + datetime.now().strftime("%Y-%m-%d %H:%M")
+    data["made"] = f"{shlex.join(command)} · ca_reg {ca_reg.__version__} · {datetime.now():%Y-%m-%d %H:%M}"
     page = Template(_part("page.html")).substitute(
-        title=f"{found[0].scene.name}: {', '.join(names)}".replace("&", "&amp;").replace("<", "&lt;"),
+        title=escape(f"{found[0].scene.name}: {', '.join(names)}", quote=False),
         style=_part("page.css"),
         data=json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c"),  # nothing ends the script
         script=_part("models.js") + _part("curves.js") + _part("page.js"),
@@ -134,9 +131,7 @@ def write_report(
 def compare_two(first: Path, second: Path) -> tuple[list[dict[str, object]], list[str]]:
     """Return the rows of `differences` between two trainings on one scene, and notes on what they rest on.
 
-    Args:
-        first: a run, or the folder of its seeds.
-        second: the other one.
+    Each is the folder of a run, or that of its seeds.
 
     Raises:
         FileNotFoundError: if a folder holds no run.
@@ -182,8 +177,7 @@ def compare_two(first: Path, second: Path) -> tuple[list[dict[str, object]], lis
 def labels(runs: Sequence[Path]) -> list[str]:
     """Return a label for each run: its path below the folder common to all, the name of a single one.
 
-    Raises:
-        ValueError: if there is no run, or one is given twice.
+    Raises ValueError if there is no run, or one is given twice.
 
     Example:
         >>> labels([Path("runs/fern/baseline/seed_0"), Path("runs/fern/dropout/seed_0")])
@@ -216,7 +210,7 @@ def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Pa
     low, high = (end * middle for end in PER_WEIGHT_SCALE)
     attribution = [row for each in found if (row := each.attribution())]
     return {
-        "about": [str(found[0].scene), *_trained(found)],
+        "about": [str(found[0].scene), *map(_trained, found)],
         "notes": notes + missing,
         "scene": found[0].scene.name,
         "verdict": said,
@@ -244,13 +238,10 @@ def _renamed(results: dict[str, Any]) -> dict[str, Any]:
     return results | {"views": views}
 
 
-def _trained(found: Sequence[Findings]) -> list[str]:
-    """Return a line per run about what it was trained with."""
-    return [
-        f"{each.label}: {each.model.step:,} steps with {each.model.regularizer or 'no regularizer'}; "
-        f"{len(each.model.gaussians):,} Gaussians"
-        for each in found
-    ]
+def _trained(each: Findings) -> str:
+    """Return a line about what a run was trained with."""
+    steps, regularizer = f"{each.model.step:,} steps", each.model.regularizer or "no regularizer"
+    return f"{each.label}: {steps} with {regularizer}; {len(each.model.gaussians):,} Gaussians"
 
 
 def _strategies(

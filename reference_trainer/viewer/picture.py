@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import torch
+from kornia.geometry import create_meshgrid, remap
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise, Reason
 from reference_trainer.camera import Camera
@@ -34,21 +34,16 @@ Mode = Literal["render", "co-adaptation", "expected error", "support", "depth", 
 class DisplayOptions:
     """How a model is shown.
 
-    Args:
-        mode: the test-time render, the exact CA map, where the render is expected to be wrong (`ErrorMaps`), how many
-            training photographs show what is there, depth, or the Gaussians in the colors of their `Heat`.
-        drop_rate: of the CA map and of the mask, in [0, 1).
-        noise: standard deviation of the opacity noise, at least 0: the CA map is that of dropout and noise together,
-            all other pictures show one draw of it.
-        mask: whether pictures other than the CA map drop the Gaussians of one random mask.
-        hidden: fraction of the Gaussians to leave out, those of highest heat first, in [0, 1).
+    The modes are the test-time render, the exact CA map, where the render is expected to be wrong (`ErrorMaps`), how
+    many training photographs show what is there, depth, and the Gaussians in the colors of their `Heat`. The CA map is
+    that of dropout and noise together; all other pictures show one draw of the noise.
     """
 
     mode: Mode = "render"
-    drop_rate: float = 0.5
-    noise: float = 0.0
-    mask: bool = False
-    hidden: float = 0.0
+    drop_rate: float = 0.5  # of the CA map and of the mask, in [0, 1)
+    noise: float = 0.0  # standard deviation of the opacity noise, at least 0
+    mask: bool = False  # whether pictures other than the CA map drop the Gaussians of one random mask
+    hidden: float = 0.0  # fraction of the Gaussians to leave out, those of highest heat first, in [0, 1)
 
 
 class Picture(NamedTuple):
@@ -62,11 +57,9 @@ class Picture(NamedTuple):
 class ViewerModel:
     """A model to show; what successive pictures share is computed once.
 
-    Args:
-        model: what to draw.
-        views: that its heat is measured at, on the model's device.
-        beside: whose mean heat is the unit of the colors, so that two models can be compared; by default its own.
-        train: the photographs that the model was trained on, for the expected error and the support.
+    Its heat is measured at ``views``, which are on its device; the unit of the colors is the mean heat of ``beside``,
+    so that two models can be compared, or its own. ``train`` are the photographs that it was trained on, for the
+    expected error and the support.
 
     Example:
         >>> from reference_trainer.model.gaussians import Gaussians
@@ -105,9 +98,8 @@ class ViewerModel:
     def render(self, options: DisplayOptions, camera: Camera) -> Picture:
         """Draw the model.
 
-        Raises:
-            ValueError: if heat is needed (for its colors or to hide Gaussians) and cannot be measured, see `heat`; or
-                support without photographs.
+        Raises ValueError if heat is needed (for its colors or to hide Gaussians) and cannot be measured, see `heat`; or
+        support without photographs.
         """
         if options != self._chosen_last[0]:
             self._chosen_last = options, self._chosen(options)
@@ -195,20 +187,13 @@ def _draws(options: DisplayOptions) -> Chain:
 
 
 def with_photograph(image: Tensor, camera: Camera, view: View, share: float) -> Tensor:
-    """Return an image (3, H, W) with a photograph over it, as a camera at the same place sees it.
+    """Return an image (3, H, W) mixed with a ``share``, in [0, 1], of a photograph taken from the same place.
 
-    Args:
-        image: that ``camera`` sees.
-        camera: where the camera of the photograph stands; it may be turned, or have another field of view.
-        view: the photograph.
-        share: of the photograph in the mixture, in [0, 1].
+    ``camera``, which sees the image, may be turned against that of the photograph, or have another field of view.
     """
-    x, y = torch.meshgrid(torch.arange(camera.width) + 0.5, torch.arange(camera.height) + 0.5, indexing="xy")
-    points = camera.to("cpu").lift(torch.stack([x, y], -1), torch.ones(x.shape))
+    centers = create_meshgrid(camera.height, camera.width, normalized_coordinates=False)[0] + 0.5
+    points = camera.to("cpu").lift(centers, torch.ones(camera.height, camera.width))
     pixels, depth = view.camera.to("cpu").project(points)
-    inside = view.camera.inside(pixels, depth)
-    size = pixels.new_tensor([view.camera.width, view.camera.height])
-    seen = grid_sample(
-        view.image.cpu()[None], (2 * pixels / size - 1)[None], padding_mode="border", align_corners=False
-    )
-    return torch.lerp(image.cpu(), seen[0], share * inside)
+    x, y = (pixels - 0.5)[None].unbind(-1)  # kornia's pixel centers are integers
+    seen = remap(view.image.cpu()[None], x, y, padding_mode="border", align_corners=True)[0]
+    return torch.lerp(image.cpu(), seen, share * view.camera.inside(pixels, depth))

@@ -10,7 +10,7 @@ import socket
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -50,32 +50,21 @@ BOTH = "side by side"
 
 @dataclass
 class _Window:
-    """One page.
+    """One page."""
 
-    Args:
-        client: viser's handle.
-        moved: when it last moved.
-        due: whether a picture is.
-        rough: whether the last one was at reduced resolution.
-        wish: the file that it asked for: ``"screenshot"``, ``"flight"`` or none.
-        path: cameras of the flight.
-    """
-
-    client: Any
-    moved: float
-    due: bool = True
-    rough: bool = True
-    wish: str = ""
-    path: list[Camera] = field(default_factory=list)
+    client: Any  # viser's handle
+    moved: float  # when it last moved
+    due: bool = True  # whether a picture is
+    rough: bool = True  # whether the last one was at reduced resolution
+    wish: str = ""  # the file that it asked for: "screenshot", "flight" or none
+    path: list[Camera] = field(default_factory=list)  # cameras of the flight
 
 
 class Viewer(contextlib.AbstractContextManager["Viewer", None]):
     """A context manager that serves pages on this machine which show a model, or two with one camera.
 
-    Everything is drawn in the thread that calls `serve` or `follow`: a training is drawn between its steps.
-
-    Args:
-        port: to listen at; 0 for any free one.
+    Everything is drawn in the thread that calls `serve` or `follow`: a training is drawn between its steps. It listens
+    at ``port``; 0 for any free one.
 
     Raises:
         ImportError: if viser is missing.
@@ -194,11 +183,8 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         else:
             notes = []
             for name, picture in pictures.items():
-                model = self._models[name].model
-                notes.append(
-                    f"**{name}** " * (len(self._models) > 1)
-                    + f"step {model.step:,}: {len(model.gaussians):,} Gaussians"
-                )
+                model, title = self._models[name].model, f"**{name}** " * (len(self._models) > 1)
+                notes.append(f"{title}step {model.step:,}: {len(model.gaussians):,} Gaussians")
                 notes += [picture.note] * bool(picture.note)
             self._status.content = "\n\n".join([*notes, f"{camera.width}x{camera.height} in {took * 1e3:.0f} ms"])
             if self._bar.visible != (picture.scale is not None):
@@ -231,8 +217,8 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
 
     def _photograph_at(self, camera: Camera) -> View | None:
         """Return the photograph that was taken where a camera stands, None if there is none."""
-        near = [v for v in self._photographs if (v.camera.position - camera.position).norm() < 1e-3 * self._distance]
-        return next(iter(near), None)
+        near = (v for v in self._photographs if (v.camera.position - camera.position).norm() < 1e-3 * self._distance)
+        return next(near, None)
 
     def _save(self, window: _Window, wish: str) -> None:
         """Draw what a page asked for at full resolution, with titles and color bars, and let it download the file."""
@@ -243,15 +229,14 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             return
         cameras = interpolate_cameras(window.path, MOVIE_FRAMES * (len(window.path) - 1) + 1)
 
-        def frames() -> Iterator[torch.Tensor]:
-            for number, camera in enumerate(cameras):
-                self._status.content = f"flight: picture {number + 1} of {len(cameras)}"
-                yield self._sheet(camera, notes=False)  # their lengths differ, and so would the pictures
-
+        frames = []
+        for number, camera in enumerate(cameras):
+            self._status.content = f"flight: picture {number + 1} of {len(cameras)}"
+            frames.append(self._sheet(camera, notes=False))  # their lengths differ, and so would the pictures
         with tempfile.TemporaryDirectory() as folder:
-            file_ = save_film(Path(folder), "flight", [*frames()])
-            window.client.send_file_download(file_.name, file_.read_bytes(), save_immediately=True)
-        self._status.content = f"flight: {len(cameras)} pictures in {file_.name}"
+            film = save_film(Path(folder), "flight", frames)
+            window.client.send_file_download(film.name, film.read_bytes(), save_immediately=True)
+        self._status.content = f"flight: {len(cameras)} pictures in {film.name}"
 
     def _sheet(self, camera: Camera, *, notes: bool = True) -> torch.Tensor:
         """Return what a page shows, (3, H, W), with the names of the models, color bars, and the notes on it."""
@@ -280,14 +265,8 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             gui.add_slider("Hide %", 0.0, 50.0, 0.5, 0.0, hint="Leave out the Gaussians that co-adapt most for what "
                 "they contribute to the pictures, and see what stands without them."),
         ]  # fmt: skip
-        self._photograph = gui.add_slider(
-            "Photograph %",
-            0,
-            100,
-            1,
-            0,
-            hint="Lay the photograph over the picture, where a camera stands that took one.",
-        )
+        hint = "Lay the photograph over the picture, where a camera stands that took one."
+        self._photograph = gui.add_slider("Photograph %", 0, 100, 1, 0, hint=hint)
         for control in (*self._controls, self._photograph):
             control.on_update(lambda event: self._moved())
         self._bar = gui.add_image(np.zeros((1, 320, 3), np.uint8), label=" ", visible=False)
