@@ -7,6 +7,7 @@ import logging
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -104,10 +105,7 @@ def scene_folders(paths: Sequence[str], options: SceneOptions, out: Path) -> dic
 
 
 def compare(
-    scenes: Mapping[Path, SceneOptions],
-    configs: Mapping[str, TrainConfig],
-    seeds: Sequence[int],
-    running: Running,
+    scenes: Mapping[Path, SceneOptions], configs: Mapping[str, TrainConfig], seeds: Sequence[int], running: Running
 ) -> dict[Path, Comparison]:
     """Train every strategy on every scene with every seed; finished runs are kept, interrupted ones continue.
 
@@ -130,26 +128,21 @@ def compare(
         raise ValueError(
             f"expected at least 1 scene, 1 strategy and 1 seed, got {len(scenes)}, {len(configs)} and {len(seeds)}."
         )
-    grid = [(folder, name, seed) for seed in seeds for folder in scenes for name in configs]
-    runs = [
-        Run(
-            label=_label(name, seed) if len(scenes) == 1 else f"{folder.name}, {_label(name, seed)}",
-            options=scenes[folder],
-            config=dataclasses.replace(configs[name], seed=seed),
-            out=folder / name / f"seed_{seed}",
-        )
-        for folder, name, seed in grid
-    ]
-    for run in runs:  # before any failure of these runs could take the place of their results in the file
+    runs: dict[tuple[Path, str, int], Run] = {}
+    for seed, folder, name in product(seeds, scenes, configs):
+        label = _label(name, seed) if len(scenes) == 1 else f"{folder.name}, {_label(name, seed)}"
+        run = Run(label, scenes[folder], dataclasses.replace(configs[name], seed=seed), folder / name / f"seed_{seed}")
+        # Refused before any failure of these runs could take the place of their results in the file.
         settings_of_run(run.out, run.options, run.config, auto=False, given=())
+        runs[folder, name, seed] = run
     terms = [term for config in configs.values() for term in make_losses(config)]
     if looking := [term for term in terms if type(term).begin is not LossTerm.begin]:
-        for options in {run.options for run in runs if not (run.out / RESULTS).exists()}:
+        for options in {run.options for run in runs.values() if not (run.out / RESULTS).exists()}:
             scene = load_scene(options)
             for term in looking:
                 term.begin(scene)
     comparisons = {folder: Comparison({}, {}) for folder in scenes}
-    for (folder, name, seed), outcome in zip(grid, run_grid(runs, running), strict=True):
+    for (folder, name, seed), outcome in zip(runs, run_grid([*runs.values()], running), strict=True):
         if isinstance(outcome, Failure):
             comparisons[folder].failures[_label(name, seed)] = outcome
         else:

@@ -10,6 +10,7 @@ import threading
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
@@ -66,8 +67,7 @@ Answer: TypeAlias = Value | Failure | Death
 class Executor(Protocol):
     """Starts calls in other processes and reports how they ended; `run_all` queues and retries, for every executor.
 
-    An executor serves one sweep after another. It starts nothing before the first task of each, so a sweep with nothing
-    left to do is free.
+    An executor serves one sweep after another, and starts nothing before the first task of each.
     """
 
     @property
@@ -107,10 +107,8 @@ def run_all(executor: Executor, tasks: Sequence[Task], *, retries: int = 3) -> I
     """Run tasks on an executor; yield the outcomes in the order in which they end, and close the executor.
 
     A task that raises is not retried: it would raise again. One whose worker died goes to the end of the queue, so that
-    a task that kills its workers does not delay the others.
-
-    The executor is closed at the end, also if the caller stops iterating or is interrupted. ``retries`` dead workers of
-    one task are replaced. Yields the index of a task, and its outcome.
+    a task that kills its workers, of which ``retries`` are replaced, does not delay the others. The executor is closed
+    also if the caller stops iterating or is interrupted. Yields the index of a task, and its outcome.
     """
     queue = deque(range(len(tasks)))
     running = 0
@@ -127,8 +125,8 @@ def run_all(executor: Executor, tasks: Sequence[Task], *, retries: int = 3) -> I
                     yield number, answer
                 elif deaths[number] < retries:
                     deaths[number] += 1
-                    again = f"again with another ({deaths[number]} of {retries})"
-                    _log.warning("%s: %s; %s", tasks[number].label, answer.reason, again)
+                    of = f"{deaths[number]} of {retries}"
+                    _log.warning("%s: %s; again with another (%s)", tasks[number].label, answer.reason, of)
                     queue.append(number)
                 else:
                     times = f" ({retries + 1} workers died)" if retries else ""
@@ -137,8 +135,7 @@ def run_all(executor: Executor, tasks: Sequence[Task], *, retries: int = 3) -> I
         executor.close()
 
 
-# A process forked after threads have been used, as by torch, can hang.
-_CONTEXT = get_context("spawn")
+_CONTEXT = get_context("spawn")  # a process forked after threads have been used, as by torch, can hang
 
 
 class Processes:
@@ -146,12 +143,8 @@ class Processes:
 
     A worker that loses its parent, however the parent ended, is interrupted as by Ctrl-C: the training saves a
     checkpoint and ends. Ctrl-C itself reaches only the parent, which interrupts its workers; a second one kills them.
-
-    Args:
-        jobs: tasks at a time; each may use its share of the processors, or ``OMP_NUM_THREADS`` if that is set.
-
-    Raises:
-        ValueError: if ``jobs`` is not positive.
+    Each of ``jobs`` tasks at a time may use its share of the processors, or ``OMP_NUM_THREADS`` if that is set. Raises
+    ValueError if ``jobs`` is not positive.
     """
 
     def __init__(self, jobs: int) -> None:
@@ -175,11 +168,9 @@ class Processes:
         answering: list[Any] = wait([*self._running])
         for here in answering:
             number, process = self._running.pop(here)
-            try:
-                answer: Answer | None = here.recv()
-            except (EOFError, OSError):
-                answer = None
-            here.close()
+            answer: Answer | None = None
+            with here, suppress(EOFError, OSError):  # as when the worker has died
+                answer = here.recv()
             process.join()
             ended.append((number, Death(_reason(process.exitcode)) if answer is None else answer))
         return ended
@@ -216,14 +207,14 @@ def _work(there: Connection, task: Task, threads: int) -> None:
 
 def _end_with_parent(there: Connection, answered: threading.Event) -> None:
     """Interrupt the task when the parent closes its end of the pipe, or dies; the parent never sends anything."""
-    try:
+    with suppress(EOFError, OSError):
         there.recv()
-    except (EOFError, OSError):
-        if not answered.is_set():
-            if os.name == "posix":
-                os.kill(os.getpid(), signal.SIGINT)  # unlike interrupt_main, also ends a blocking system call
-            else:
-                _thread.interrupt_main()
+    if answered.is_set():
+        return
+    if os.name == "posix":
+        os.kill(os.getpid(), signal.SIGINT)  # unlike interrupt_main, also ends a blocking system call
+    else:
+        _thread.interrupt_main()
 
 
 def _reason(code: int | None) -> str:
@@ -247,11 +238,8 @@ class RayCluster:
     Of ``jobs`` tasks at a time, each reserves its share of the cluster's processors, at most those of one machine, and
     so many ``gpus``; fractions share one. ``address`` names a running cluster, as for `ray.init`: ``"host:6379"``,
     ``"ray://host:10001"``, or ``"auto"`` for the one that this machine belongs to; by default ``$RAY_ADDRESS``, or if
-    that is unset a cluster on this machine that ends with the sweep.
-
-    Raises:
-        ValueError: if ``jobs`` is not positive.
-        ImportError: if Ray is not installed.
+    that is unset a cluster on this machine that ends with the sweep. Raises ValueError if ``jobs`` is not positive, and
+    ImportError if Ray is not installed.
     """
 
     def __init__(self, jobs: int, *, address: str | None = None, gpus: float = 0.0) -> None:

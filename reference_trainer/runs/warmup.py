@@ -9,9 +9,16 @@ from dataclasses import replace
 
 import torch
 
+from ca_reg.functional import Multiplier
 from reference_trainer.progress import progress_bar
 from reference_trainer.render import describe_engine, render_moments, variance_shares
+from reference_trainer.runs.run import model_of
+from reference_trainer.scenes import synthetic_scene
+from reference_trainer.scenes.images import resize_image
 from reference_trainer.scenes.scene import View
+from reference_trainer.threads import threads_for
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.trainer import Trainer
 
 __all__ = ["step_seconds", "warm_up"]
 
@@ -52,12 +59,6 @@ def step_seconds(width: int, height: int, device: str = "cpu") -> float:
 
     After `warm_up`, else what is compiled counts.
     """
-    from reference_trainer.scenes import synthetic_scene
-    from reference_trainer.scenes.images import resize_image
-    from reference_trainer.threads import threads_for
-    from reference_trainer.training.config import TrainConfig
-    from reference_trainer.training.trainer import Trainer
-
     scene = synthetic_scene(width=40, height=30, points=max(10, width * height // 10))
     views = tuple(
         View(view.name, view.camera.resized(width, height), resize_image(view.image, width, height))
@@ -74,12 +75,6 @@ def step_seconds(width: int, height: int, device: str = "cpu") -> float:
 
 def _use_everything() -> None:
     """Take one training step of each kind and compute each score on a scene of a few pixels."""
-    from ca_reg.functional import Multiplier
-    from reference_trainer.runs.run import model_of
-    from reference_trainer.scenes import synthetic_scene
-    from reference_trainer.training.config import TrainConfig
-    from reference_trainer.training.trainer import Trainer
-
     scene = synthetic_scene(width=8, height=6, points=20)
     plain = TrainConfig(iterations=1, dropout=0.2)
     for config in (plain, replace(plain, analytic=True), replace(plain, density="absgrad")):
