@@ -126,8 +126,10 @@ def heat_map(values: Tensor, vmax: float) -> Tensor:
     """Color values (H, W) from 0 (black) through red to ``vmax`` (pale yellow): matplotlib's "inferno".
 
     Values beyond the ends take the end colors; those that are not finite (a pixel without a score) are gray. Use one
-    ``vmax`` for all maps to be compared. Returns colors (3, H, W) in [0, 1], float32, on the CPU. Raises ValueError if
-    ``values`` is not (H, W) or ``vmax`` is not positive.
+    ``vmax`` for all maps to be compared. Returns colors (3, H, W) in [0, 1], float32, on the CPU.
+
+    Raises:
+        ValueError: if ``values`` is not (H, W) or ``vmax`` is not positive.
 
     Example:
         >>> heat_map(torch.tensor([[0.0, 1.0]]), vmax=1.0).mean(0)[0].diff() > 0

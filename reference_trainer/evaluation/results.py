@@ -10,7 +10,6 @@ import math
 import os
 import platform
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -44,7 +43,8 @@ def write_json(path: str | Path, data: object) -> None:
         ...     json.loads(Path(f"{folder}/a/result.json").read_text())
         {'ca': None, 'views': [1, 2]}
     """
-    write_text(path, json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    text = json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    write_text(path, text)
 
 
 def machine(device: torch.device | str | None = None) -> dict[str, str | int]:
@@ -87,19 +87,26 @@ def _plain(data: object) -> object:
 
 def _cpu_name() -> str:
     """Return the processor's name; on Linux only /proc has it."""
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 class ResultStore:
     """What was measured so far, by key; every record is on disk before the next one is measured.
 
-    Records made under another ``depends_on``, which is everything that they depend on (`fingerprint`), or in a damaged
-    file, are deleted: the measurement starts anew, and says so. The caller removes the file once the final result is
-    written; a ``file`` of None keeps nothing. Raises OSError if it exists and cannot be read or removed.
+    Records made under another ``depends_on``, or in a damaged file, are deleted: the measurement starts anew, and says
+    so. The caller removes the file once the final result is written.
+
+    Args:
+        file: where to keep them; None keeps nothing.
+        depends_on: everything the records depend on, see `fingerprint`.
+
+    Raises:
+        OSError: if the file exists and cannot be read or removed.
 
     Example:
         >>> import tempfile
@@ -141,7 +148,11 @@ class ResultStore:
         return record if record is not None and all(file.is_file() for file in files) else None
 
     def add(self, key: str, record: Mapping[str, Any]) -> None:
-        """Keep a record of strings and numbers, including nan and infinity; OSError if it cannot be written."""
+        """Keep a record of strings and numbers, including nan and infinity.
+
+        Raises:
+            OSError: if it cannot be written; earlier records are kept.
+        """
         if self._file is None:
             return
         self._records[key] = dict(record)

@@ -31,11 +31,17 @@ _TOP = (0.001, 0.01, 0.1)
 
 @dataclass(frozen=True)
 class Heat:
-    """How much every Gaussian of a model co-adapts relative to its contribution to some views."""
+    """How much every Gaussian of a model co-adapts relative to its contribution to some views.
 
-    shares: Tensor  # (N,), from `mean_shares`
-    weights: Tensor  # (N,), from `blend_weights`
-    results: Sequence[CAResult]  # the exact score of every view
+    Args:
+        shares: from `mean_shares`, (N,).
+        weights: from `blend_weights`, (N,).
+        results: the exact score of every view.
+    """
+
+    shares: Tensor
+    weights: Tensor
+    results: Sequence[CAResult]
 
     @classmethod
     def of(cls, model: TrainedModel, views: Sequence[Viewpoint], *, drop_rate: float = 0.5) -> Heat:
@@ -66,11 +72,17 @@ class Heat:
 
 @dataclass(frozen=True)
 class Guard:
-    """What the `guard` found."""
+    """What the `guard` found.
 
-    keep: Tensor  # which Gaussians do not hang, (N,), bool
-    where: Counter[str]  # how many hang at which camera, the one where their share is highest
-    scores: tuple[float, ...]  # the mean exact score at the cameras that nobody took, at first and after each round
+    Args:
+        keep: which Gaussians do not hang, (N,), bool.
+        where: how many hang at which camera, the one where their share is highest.
+        scores: the mean exact score at the cameras that nobody took, at first and after each round.
+    """
+
+    keep: Tensor
+    where: Counter[str]
+    scores: tuple[float, ...]
 
     def __str__(self) -> str:
         if not self.where:
@@ -89,8 +101,9 @@ def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None =
     ``rounds`` are over. Scores are those of the drop rate of the training, or of 0.2 after noise. No photograph is
     looked at. Costs about four renders per camera of ``views``, by default all `unseen_views`, and round.
 
-    Raises ValueError if the model was trained without anything that drops or is noisy, or the scene has fewer than two
-    training cameras.
+    Raises:
+        ValueError: if the model was trained without anything that drops or is noisy, whose Gaussians need each other,
+            or the scene has fewer than two training cameras.
     """
     if not len(model.chain):
         raise ValueError(
@@ -184,7 +197,10 @@ def mean_shares(
     """Attribute the exact score of several views to the Gaussians.
 
     The views are on the model's device. Returns the shares, averaged over the views that have a score, shape (N,),
-    float64, which add up to the mean score; and the result of every view. Raises ValueError if no view has a score.
+    float64, which add up to the mean score; and the result of every view.
+
+    Raises:
+        ValueError: if no view has a score.
     """
     score, opacities = model.exact_ca_score(drop_rate=drop_rate), model.gaussians.opacities
     total, results = torch.zeros_like(opacities, dtype=torch.float64), []

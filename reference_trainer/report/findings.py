@@ -35,18 +35,32 @@ MOST_UNSEEN = 27
 
 @dataclass(frozen=True)
 class Findings:
-    """What a report knows about a run."""
+    """What a report knows about a run.
 
-    label: str  # what the page calls it
-    model: TrainedModel  # at its last checkpoint
-    opacities: Tensor  # that the page draws it with, (N,)
+    Args:
+        label: what the page calls it.
+        model: at its last checkpoint.
+        opacities: that the page draws it with, (N,).
+        scene: what it was trained on.
+        views: that it is shown from, by split, those that were not trained on first if they have photographs.
+        pictures: per view, ``"render"`` and where they exist ``"error"``, ``"expected error"`` and ``"co-adaptation"``,
+            and a ``"caption"``.
+        heat: of the exact score over these views; None if there is no score to attribute.
+        notes: what is missing, and why.
+        unseen: cameras that nobody took, with what is expected there.
+        hangs: what hangs there; None for a model that cannot be guarded.
+    """
+
+    label: str
+    model: TrainedModel
+    opacities: Tensor
     scene: Scene
-    views: Mapping[str, Sequence[Viewpoint]]  # by split, photographs that were not trained on first
-    pictures: list[dict[str, str]]  # of each view, see `pictures_of`
-    heat: Heat | None  # of the exact score over these views; None if there is no score to attribute
-    notes: list[str]  # what is missing, and why
-    unseen: Sequence[tuple[Viewpoint, ErrorMap]] = ()  # cameras that nobody took, with what is expected there
-    hangs: Guard | None = None  # what hangs there; None for a model that cannot be guarded
+    views: Mapping[str, Sequence[Viewpoint]]
+    pictures: list[dict[str, str]]
+    heat: Heat | None
+    notes: list[str]
+    unseen: Sequence[tuple[Viewpoint, ErrorMap]] = ()
+    hangs: Guard | None = None
 
     def packed(self, low: float, high: float) -> dict[str, Any]:
         """Return the model as the page draws it: its Gaussians in the order of their heat, those of least heat first.
@@ -54,8 +68,11 @@ class Findings:
         ``values`` are `quantized` columns: the position (3) less ``center``, in units of ``scale`` and as
         sign(x) log(1 + |x|), the logarithm of the scales (3), the quaternion (4, wxyz), opacity, color of the heat (3),
         and the coefficients of the spherical harmonics, ((degree + 1)^2, 3). ``held`` is the fraction of the score held
-        by the 0, 1, ... 100 % of the Gaussians of most heat. ``low`` and ``high`` are the shares per weight of the
-        darkest and of the brightest color.
+        by the 0, 1, ... 100 % of the Gaussians of most heat.
+
+        Args:
+            low: share per weight of the darkest color.
+            high: share per weight of the brightest color.
         """
         order, n = torch.arange(len(self.model.gaussians)), len(self.model.gaussians)
         heat, held = torch.full((n, 3), 0.5), list[float]()
@@ -106,8 +123,16 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Colle
     """Draw a run's last checkpoint from its views, and attribute the exact score at drop rate 1/2 to its Gaussians.
 
     What is expected of a view is expected from the model and the training photographs, so not of those themselves.
-    ``label`` is what the page calls the run, ``views`` how many of each split it shows, evenly spaced. ``trust`` and
-    errors are those of `load_run`.
+
+    Args:
+        run: its folder.
+        label: what the page calls it.
+        views: how many of each split, evenly spaced.
+        device: where to render.
+        trust: as for `load_run`.
+
+    Raises:
+        FileNotFoundError: if the folder holds no run.
     """
     model, scene = load_run_model(run, device, trust=trust)
     notes: list[str] = []
@@ -145,10 +170,7 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Colle
 def pictures_of(
     model: TrainedModel, view: Viewpoint, expected: ErrorMap | None, result: CAResult | None = None
 ) -> dict[str, str]:
-    """Draw a view: the data URIs of ``"render"`` and, where there are these, of its maps; and their ``"caption"``.
-
-    The maps are ``"error"``, ``"expected error"`` and ``"co-adaptation"``.
-    """
+    """Return the pictures of a view as data URIs, and their caption."""
     image = model.test_rendering(view).image.clamp(0, 1)
     found, said = {"render": image_uri(image)}, []
     if isinstance(view, View):

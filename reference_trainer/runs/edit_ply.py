@@ -48,8 +48,10 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None, trus
         FileNotFoundError: if there is no source.
 
     Example:
+        >>> import tempfile
+        >>> import torch
         >>> from reference_trainer.model.gaussians import Gaussians
-        >>> from reference_trainer.model.ply import load_ply
+        >>> from reference_trainer.model.ply import load_ply, save_ply
         >>> gaussians = Gaussians.from_points(torch.rand(5, 3), torch.rand(5, 3), torch.full((5,), 0.1), sh_degree=0)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     plain, baked = Path(folder, "plain.ply"), Path(folder, "baked.ply")

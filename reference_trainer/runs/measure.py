@@ -39,7 +39,11 @@ def load_run_model(
     """Return a run's model at its last checkpoint, and its scene; logs where that is if the training is not finished.
 
     With ``regularizer``, such as "noise(0.8, scale=True)" for a run with "noise(0.8)", the model is treated as if it
-    had been trained with that; ValueError if it cannot be parsed. ``trust`` and other errors are as for `load_run`.
+    had been trained with that. ``trust`` is as for `load_run`.
+
+    Raises:
+        FileNotFoundError: if the folder holds no run.
+        ValueError: if the expression cannot be parsed, or the run names code that is not trusted.
     """
     trainer = load_run(run, device, trust=trust)
     if trainer.step < (last := trainer.config.iterations):
@@ -64,12 +68,14 @@ def measure(
     """Measure a model at views; write ``evaluation.json``, ``evaluation.md`` and pictures, and print the table.
 
     After an interruption, the same call continues with the next view. Views, samples, seed and metric are as for
-    `evaluate`; ``about`` holds further entries of the JSON file, such as the name of the scene. Raises ValueError if
-    ``out`` holds files of these names that are not from here.
+    `evaluate`; ``about`` holds further entries of the JSON file, such as the name of the scene.
+
+    Raises:
+        ValueError: if ``out`` holds files of these names that are not from here.
     """
-    partial = out / PARTIAL
-    if not ((out / EVALUATION).exists() or partial.exists()):
+    if not ((out / EVALUATION).exists() or (out / PARTIAL).exists()):
         check_output(out, None, ("evaluation.md", VIEWS))
+    partial = out / PARTIAL
     largest = max(view.camera.width * view.camera.height for of in views.values() for view in of)
     with run_lock(out), threads_for(largest):
         remove_leftovers(out / VIEWS)
@@ -129,8 +135,10 @@ def render_run(
     written as a film (`save_film`) and takes the place of an earlier flight, or ``"auto"``: the test views, or if there
     is none the training views. ``"error"`` adds a heat map of the expected error to each test view, or if there is
     none, to views between and around the training cameras, and with ``mask`` a third picture, white where the expected
-    error is above that. ``trust`` is as for `load_run`. Raises ValueError if there is no test view to render, or a
-    picture of somebody else's would be overwritten.
+    error is above that. ``trust`` is as for `load_run`.
+
+    Raises:
+        ValueError: if there is no test view to render, or a picture of somebody else's would be overwritten.
     """
     model, scene = load_run_model(run, device, trust=trust)
     if what == "auto":
