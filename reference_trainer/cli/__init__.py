@@ -46,7 +46,7 @@ def _run(arguments: Sequence[str]) -> None:
     try:
         command = _parse(arguments)
         computing = command.what if isinstance(command, Study) else command
-        if hasattr(computing, "check"):
+        if hasattr(computing, "check"):  # refuses what cannot work, before anything heavy is imported
             computing.check()
         if hasattr(computing, "device"):
             check_device(computing.device, here=not (isinstance(command, Compare) and command.elsewhere))

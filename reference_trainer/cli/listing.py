@@ -30,7 +30,8 @@ registry = ConstructorRegistry()
 def _options(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Return the fields of a dataclass of this package with their texts, those of a training in groups."""
     kind, default = info.type, info.default
-    if not (dataclasses.is_dataclass(kind) and kind.__module__.startswith("reference_trainer.")) or _is_group(kind):
+    made_here = kind.__module__ == __name__  # a group, of which tyro reads all it needs, and which has no source
+    if made_here or not (dataclasses.is_dataclass(kind) and kind.__module__.startswith("reference_trainer.")):
         return None
     given = vars(default) if isinstance(default, kind) else {}
     hints, texts = get_type_hints(kind, include_extras=True), _texts(kind)
@@ -52,11 +53,6 @@ def _options(info: StructTypeInfo) -> StructConstructorSpec | None:
         lambda **found: TrainConfig(**{name: x for group in found.values() for name, x in vars(group).items()}),
         tuple(StructFieldSpec(name, group, group()) for name, group in kinds.items()),
     )
-
-
-def _is_group(kind: type) -> bool:
-    """Return whether a class was made here: tyro reads what it needs from its fields, and it has no source."""
-    return kind.__module__ == __name__
 
 
 def _default(field: dataclasses.Field[Any]) -> Any:

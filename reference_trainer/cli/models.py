@@ -8,18 +8,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from reference_trainer.cli.options import (
-    Device,
-    Orbit,
-    PlyScene,
-    Rendering,
-    RenderOptions,
-    Trust,
-    check_model,
-    check_out,
-    check_ply,
-    place_of,
-)
+from reference_trainer.cli import options
+from reference_trainer.cli.options import Device, Orbit, PlyScene, Rendering, RenderOptions, Trust, place_of
 from reference_trainer.cli.training import PORT, Lpips
 from reference_trainer.runs.folder import check_run, folder_name, modules_named, report_file, runs_of
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
@@ -56,12 +46,11 @@ class Evaluate:
     rendering: Rendering = field(default_factory=RenderOptions)
 
     def check(self) -> None:
-        """Refuse what cannot work, before anything heavy is imported."""
         place = place_of(self.run, self.scene, self.orbit)
         if isinstance(place, OrbitOptions) and self.lpips is not None:
             raise ValueError("without photographs there is no --lpips: give --scene.")
-        check_model(self.run, place)
-        check_out(self.out, self.run, place)
+        options.check_model(self.run, place)
+        options.check_out(self.out, self.run, place)
 
     def __call__(self) -> None:
         from reference_trainer.evaluation.lpips import load_lpips
@@ -110,9 +99,8 @@ class Render:
     rendering: Rendering = field(default_factory=RenderOptions)
 
     def check(self) -> None:
-        """Refuse what cannot work, before anything heavy is imported."""
         check_run(self.run)
-        check_out(self.out, self.run)
+        options.check_out(self.out, self.run)
         if self.mask is not None and not (self.what == "error" and 0 < self.mask < 1):
             got = f"--what {self.what} --mask {self.mask:g}"
             raise ValueError(f"--mask needs --what error and a threshold in (0, 1), got {got}.")
@@ -146,7 +134,6 @@ class Report:
     rendering: Rendering = field(default_factory=RenderOptions)
 
     def check(self) -> None:
-        """Refuse what cannot work, before anything heavy is imported."""
         if not self.runs:
             raise ValueError("expected at least 1 run to report on: give the --out folders of ca-reg train.")
         if self.out is not None and self.out.is_dir():
@@ -206,11 +193,10 @@ class View:
     rendering: Rendering = field(default_factory=RenderOptions)
 
     def check(self) -> None:
-        """Refuse what cannot work, before anything heavy is imported."""
         if not 1 <= len(self.runs) <= 2 or len(set(self.runs)) < len(self.runs):
             raise ValueError(f"expected 1 model to show, or 2 that differ, got {[str(run) for run in self.runs]}.")
         for run in self.runs:
-            check_model(run, place_of(run, self.scene, self.orbit))
+            options.check_model(run, place_of(run, self.scene, self.orbit))
 
     def __call__(self) -> None:
         from reference_trainer.runs.measure import load_run_model
@@ -252,9 +238,8 @@ class Bake:
     trust: Trust = ()
 
     def check(self) -> None:
-        """Refuse what cannot work, before anything heavy is imported."""
-        check_ply(self.ply)
-        check_model(self.ply, OrbitOptions())
+        options.check_ply(self.ply)
+        options.check_model(self.ply, OrbitOptions())
 
     def __call__(self) -> None:
         from reference_trainer.runs.edit_ply import SMALL, bake_ply, compress_ply
@@ -299,9 +284,8 @@ class Clean:
     rendering: Rendering = field(default_factory=RenderOptions)
 
     def check(self) -> None:
-        """Refuse what cannot work, before anything heavy is imported."""
-        check_ply(self.ply)
-        check_model(self.ply, place_of(self.ply, self.scene, self.orbit))
+        options.check_ply(self.ply)
+        options.check_model(self.ply, place_of(self.ply, self.scene, self.orbit))
 
     def __call__(self) -> None:
         from reference_trainer.runs.edit_ply import clean_ply

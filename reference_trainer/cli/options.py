@@ -21,7 +21,6 @@ __all__ = [
     "check_scenes", "place_of", "refuse_old_options",
 ]  # fmt: skip
 
-
 _OLD = {
     ("--renderer", "torch"): "the renderer of this package is called builtin: --renderer builtin",
     ("--engine", "loops"): "this engine is called by what compiles it: --engine numba",
@@ -51,9 +50,7 @@ class RenderOptions:
     def begin(self, device: str, *, trains: bool = False) -> None:
         """Choose the engine of this process and its workers, and print which it is.
 
-        Args:
-            device: where to render.
-            trains: whether all loops will be needed: those not compiled yet are then compiled now, with progress.
+        One that ``trains`` needs all loops: those not compiled yet are then compiled now, with progress.
         """
         import torch
 
@@ -84,8 +81,7 @@ class PlyScene(SceneOptions):
 def place_of(source: Path, scene: PlyScene, orbit: OrbitOptions) -> SceneOptions | OrbitOptions | None:
     """Return the scene or orbit of a PLY; None for the folder of a run, which has its own scene.
 
-    Raises:
-        ValueError: if options are given that do not apply.
+    Options that do not apply are refused with a ValueError.
     """
     if not is_ply(source):
         if (scene, orbit) != (PlyScene(), OrbitOptions()):
@@ -103,11 +99,7 @@ def place_of(source: Path, scene: PlyScene, orbit: OrbitOptions) -> SceneOptions
 
 
 def check_model(source: Path, place: SceneOptions | OrbitOptions | None) -> None:
-    """Refuse a run, a PLY or its scene that is not there.
-
-    Raises:
-        FileNotFoundError: saying what was expected.
-    """
+    """Refuse a run, a PLY or its scene that is not there, with a FileNotFoundError that says what was expected."""
     if place is None:
         check_run(source)
     elif not source.is_file():
@@ -123,16 +115,7 @@ def check_ply(source: Path) -> None:
 
 
 def check_out(out: Path | None, source: Path, place: SceneOptions | OrbitOptions | None = None) -> None:
-    """Refuse to write into the folder of the photographs.
-
-    Args:
-        out: where to write, if it was given.
-        source: the run or PLY.
-        place: of the PLY, as of `place_of`.
-
-    Raises:
-        ValueError: if ``out`` is the scene of the run or of the PLY.
-    """
+    """Refuse, with a ValueError, to write into the photographs of a run, or of a PLY whose `place_of` is given."""
     if out is not None:
         scene = read_run_settings(source / CONFIG)[0] if place is None else place
         check_output(out, scene.path if isinstance(scene, SceneOptions) else None, ())

@@ -18,21 +18,7 @@ import tyro
 
 from reference_trainer.cli.options import Device, Rendering, RenderOptions
 from reference_trainer.json_files import read_json
-from reference_trainer.runs.folder import (
-    BAKED_PLY,
-    CHECKPOINT,
-    COMPARISON,
-    CONFIG,
-    PLAN,
-    PLY,
-    RESULTS,
-    SCENE,
-    VIEWS,
-    check_output,
-    report_file,
-    run_lock,
-    settings_of_run,
-)
+from reference_trainer.runs import folder as run
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import with_recipe
@@ -46,10 +32,10 @@ PRESETS = {"quick": (1_000, 100_000), "default": (2_000, 200_000), "quality": (5
 MARK = "photographs.json"
 Step = Literal["photographs", "poses", "train", "evaluate", "report"]
 _WRITTEN: dict[Step, tuple[str, ...]] = {
-    "photographs": (MARK, SCENE),
-    "poses": (f"{SCENE}/*/sparse",),
-    "train": (CHECKPOINT, CONFIG, PLAN, PLY, BAKED_PLY, "ca.jsonl", "events.out.*"),
-    "evaluate": (RESULTS, "evaluation.partial.json", VIEWS),
+    "photographs": (MARK, run.SCENE),
+    "poses": (f"{run.SCENE}/*/sparse",),
+    "train": (run.CHECKPOINT, run.CONFIG, run.PLAN, run.PLY, run.BAKED_PLY, "ca.jsonl", "events.out.*"),
+    "evaluate": (run.RESULTS, "evaluation.partial.json", run.VIEWS),
     "report": ("report.html",),
 }
 """What each step writes. `--from` deletes that of a step and of those after it."""
@@ -102,7 +88,6 @@ class Run:
         return place.name if place.is_dir() else place.stem
 
     def check(self) -> None:
-        """Refuse what cannot work, before anything heavy is imported."""
         if not self.photos.exists():
             raise FileNotFoundError(f"there is no {self.photos}: give the folder of the photographs, or a video.")
         if self.quick and self.quality:
@@ -111,9 +96,9 @@ class Run:
             raise ValueError(f"expected at least 2 --frames of a video, got {self.frames}.")
         if self.folder.resolve() in self.photos.resolve().parents:
             raise ValueError(f"the photographs are in {self.folder}, to which nothing is written: give another --out.")
-        others = (SCENE, CONFIG, CHECKPOINT, PLY, RESULTS, VIEWS, COMPARISON)
-        check_output(self.folder, self.photos, () if (self.folder / MARK).exists() else others)
-        report_file([self.folder])
+        others = (run.SCENE, run.CONFIG, run.CHECKPOINT, run.PLY, run.RESULTS, run.VIEWS, run.COMPARISON)
+        run.check_output(self.folder, self.photos, () if (self.folder / MARK).exists() else others)
+        run.report_file([self.folder])
 
     def __call__(self) -> None:
         from reference_trainer.runs.run import run_experiment
@@ -136,7 +121,7 @@ class Run:
         sources, wrong = sort_photographs(self.photos)
         for name, why in wrong.items():
             print(f"not read, and left out: {'' if name in why else f'{name}: '}{why}", file=sys.stderr)
-        scene, mark = self.folder / SCENE / self._name, self.folder / MARK
+        scene, mark = self.folder / run.SCENE / self._name, self.folder / MARK
         with suppress(ValueError, FileNotFoundError):
             find_reader(self.photos, "auto")
             scene = self.photos
@@ -146,7 +131,7 @@ class Run:
             held = f"{len(sources) or 'no'} photograph{'s' * (len(sources) != 1)}"
             raise ValueError(f"{self.photos} holds {held} that can be read; it takes at least 2, better 3 or more.")
         about: dict[str, Any] = {"frames": self.frames, "files": {path.name: path.stat().st_size for path in sources}}
-        with run_lock(self.folder):
+        with run.run_lock(self.folder):
             if self.again == "photographs":  # else those that changed are refused with everything in place
                 self._begin_again("photographs", "poses", "train")
             before = read_json(mark) if mark.exists() else {}
@@ -162,7 +147,7 @@ class Run:
                     "--out, or begin again with --from photographs."
                 )
             elif scene != self.photos:  # where they were put, by the name that the photographs had then
-                scene = next((images.parent for images in (self.folder / SCENE).glob("*/images")), scene)
+                scene = next((images.parent for images in (self.folder / run.SCENE).glob("*/images")), scene)
             self._begin_again("poses", "train")
         return scene
 
@@ -191,9 +176,9 @@ class Run:
         factor = max(1.0, math.sqrt(math.prod(self._sizes(scene)[0]) / pixels))
         options = SceneOptions(str(scene), test=self.test, points=self.points, downscale=round(factor, 3))
         config = with_recipe(RECIPE, iterations=steps)
-        if (self.folder / CONFIG).exists():
+        if (self.folder / run.CONFIG).exists():
             try:
-                settings_of_run(self.folder, options, config, auto=True, given=())
+                run.settings_of_run(self.folder, options, config, auto=True, given=())
             except ValueError as error:
                 raise ValueError(f"{error} Or train again with --from train.") from error
         return options, config
@@ -211,12 +196,12 @@ class Run:
         from reference_trainer.scenes.poses import FEW, feature_size
         from reference_trainer.training.checkpoint import load_checkpoint
 
-        if (self.folder / RESULTS).exists():
+        if (self.folder / run.RESULTS).exists():
             return "Trained and measured before."
         (width, height), count = self._sizes(scene)
         factor, done = options.downscale or 1.0, 0
-        if (self.folder / CHECKPOINT).exists():
-            done = load_checkpoint(self.folder / CHECKPOINT)["step"]
+        if (self.folder / run.CHECKPOINT).exists():
+            done = load_checkpoint(self.folder / run.CHECKPOINT)["step"]
         size = round(width / factor), round(height / factor)
         pixels, step = math.prod(size), step_seconds(*size, self.device)
         core = step if self.device == "cpu" else _REFERENCE * pixels  # cameras and points are found by the processor
@@ -243,17 +228,16 @@ class Run:
         if found := colmap_folders(scene):
             print(f"poses: in {found[0]}, as before")
             return
-        with run_lock(self.folder):
+        with run.run_lock(self.folder):
             print(find_poses(scene, progress=True))
 
     def _report(self) -> None:
         """Write the page and open it."""
         from reference_trainer.evaluation.tables import print_table, summary
         from reference_trainer.report.page import write_report
-        from reference_trainer.runs.folder import read_results
 
-        page, results = self.folder / "report.html", self.folder / RESULTS
-        print_table(summary(read_results(self.folder)))
+        page, results = self.folder / "report.html", self.folder / run.RESULTS
+        print_table(summary(run.read_results(self.folder)))
         if not page.exists() or page.stat().st_mtime < results.stat().st_mtime:
             write_report([self.folder], device=self.device)
         else:

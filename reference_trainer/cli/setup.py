@@ -32,12 +32,10 @@ class Poses:
     """Seed of all randomness."""
 
     def check(self) -> None:
-        """Refuse a folder that is not there, before anything heavy is imported."""
         if not self.photos.is_dir():
             raise FileNotFoundError(f"there is no folder {self.photos}: give the folder of the photographs.")
 
     def __call__(self) -> None:
-        """Run the command."""
         from reference_trainer.scenes.poses import find_poses
 
         found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, progress=True)

@@ -14,10 +14,7 @@ from reference_trainer.scenes.options import OrbitOptions
 
 __all__ = ["MOVED", "ErrorRuntime", "Stability", "Study"]
 
-MOVED = {
-    "paper": "python -m benchmarks.paper",
-    "attribution": "python -m benchmarks.attribution",
-}
+MOVED = {"paper": "python -m benchmarks.paper", "attribution": "python -m benchmarks.attribution"}
 """Former studies, which are evidence and no part of the installation: how they are called from a checkout."""
 
 
@@ -37,7 +34,6 @@ class ErrorRuntime:
     device: Device = "cpu"
 
     def check(self) -> None:
-        """Refuse what cannot work, before anything heavy is imported."""
         for source in self.sources:
             check_model(source, OrbitOptions() if is_ply(source) else None)
 

@@ -135,7 +135,6 @@ class Train:
     """One thread and repeatable algorithms: the same result whatever the number of threads, and on CUDA every time."""
 
     def check(self) -> None:
-        """Refuse what cannot work, before anything heavy is imported."""
         scene = _chosen(self.scene, self.folder)
         check_scenes([scene.path])
         check_output(self.out, scene.path, ())
@@ -206,7 +205,6 @@ class Plan:
     """JSON file for the plan; by default none is written."""
 
     def check(self) -> None:
-        """Refuse what cannot work, before anything heavy is imported."""
         check_scenes([_chosen(self.scene, self.folder).path])
         if self.out is not None and self.out.exists() and '"items"' not in self.out.read_text("utf-8", "ignore"):
             raise ValueError(f"{self.out} is no plan of ca-reg and is not overwritten: give another --out.")
@@ -279,7 +277,6 @@ class Compare:
     rendering: Rendering = field(default_factory=RenderOptions)
 
     def check(self) -> None:
-        """Refuse what cannot work, before anything heavy is imported."""
         if self.folders and self.path:
             raise ValueError(
                 f"give the scenes as arguments or as --path, not both: got {self.folders} and {self.path}."
