@@ -28,18 +28,11 @@ _OTHER_LINES = ("ply", "format", "obj_info", "end_header")  # of a header, besid
 
 @dataclass(frozen=True)
 class PlyVertices:
-    """The vertices of a PLY file.
+    """The vertices of a PLY file."""
 
-    Args:
-        rows: one record per vertex, with a field per property.
-        kinds: the numpy type that the file declares for each property, such as ``u1``; an ASCII file's rows hold
-            float64 regardless.
-        comments: the comment lines of the header.
-    """
-
-    rows: NDArray[np.void]
-    kinds: dict[str, str]
-    comments: list[str]
+    rows: NDArray[np.void]  # one record per vertex, with a field per property
+    kinds: dict[str, str]  # the numpy types that the file declares, such as ``u1``; ASCII rows hold float64 regardless
+    comments: list[str]  # of the header
 
     def columns(self, names: Sequence[str]) -> Tensor:
         """Return properties as columns, shape (N, len(names)), float32; values beyond its range become infinite."""
@@ -53,9 +46,8 @@ class PlyVertices:
 def read_ply(path: Path) -> PlyVertices:
     """Read the vertices, which must be the file's first element; binary of either byte order or ASCII.
 
-    Raises:
-        ValueError: if the file is not such a PLY, is compressed, or is shorter or longer than its header says.
-        OSError: if the file cannot be read.
+    Raises ValueError if the file is not such a PLY, is compressed, or is shorter or longer than its header says;
+    OSError if the file cannot be read.
     """
     with path.open("rb") as file:
         header = _read_header(file, path)

@@ -34,25 +34,15 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class View(Viewpoint):
-    """One photograph with its camera.
+    """One photograph with its camera, both of one size."""
 
-    Args:
-        name: the file name or another unique label.
-        camera: its camera; ``camera.height`` and ``camera.width`` equal the image's.
-        image: colors in [0, 1], shape (3, H, W), float32, already composited on the scene's background.
-        alpha: coverage in [0, 1], shape (H, W), if the source has one.
-        depth: true depth along the camera's z axis, shape (H, W), if known; 0 where nothing is hit.
-        mask: the region that counts in an evaluation, in [0, 1], shape (H, W), if the source has one (DTU's object);
-            it is not applied to the image.
-        depth_prior: what a loss may compare depth with, larger where farther, of unknown scale and shift, shape (H, W):
-            a depth, or a negated inverse depth; nan where unknown.
-    """
-
-    image: Tensor
-    alpha: Tensor | None = None
-    depth: Tensor | None = None
-    mask: Tensor | None = None
+    image: Tensor  # colors in [0, 1], shape (3, H, W), float32, already composited on the scene's background
+    alpha: Tensor | None = None  # coverage in [0, 1], shape (H, W), if the source has one
+    depth: Tensor | None = None  # true depth along the camera's z axis, shape (H, W), if known; 0 where nothing is hit
+    mask: Tensor | None = None  # what counts in an evaluation, in [0, 1], shape (H, W); it is not applied to the image
     depth_prior: Tensor | None = None
+    """What a loss may compare depth with, larger where farther, of unknown scale and shift, shape (H, W): a depth, or a
+    negated inverse depth; nan where unknown."""
 
 
 @dataclass(frozen=True)
