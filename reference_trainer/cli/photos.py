@@ -205,16 +205,15 @@ class Run:
         size = round(width / factor), round(height / factor)
         pixels, step = math.prod(size), step_seconds(*size, self.device)
         core = step if self.device == "cpu" else _REFERENCE * pixels  # cameras and points are found by the processor
-        times = {
-            "training": step * _TRAINING * (config.iterations - done),
-            "scores and page": step * _SHOWN * 3 * min(count, 8),
-        }
-        if not done and (self.points == "dense" or (self.points == "auto" and count <= MOST)):
-            times = {"points": core * _MATCHED * count * math.prod(matched_size(*size)) / pixels, **times}
+        times = {}
         if scene != self.photos and not colmap_folders(scene):
             megapixels = math.prod(feature_size(width, height, few=count < FEW)) / 1e6
             work = count * megapixels * (10.0 if count < FEW else 2.0) + 0.025 * count * (count - 1) / 2
-            times = {"poses": core / (_REFERENCE * pixels) * work, **times}
+            times["poses"] = core / (_REFERENCE * pixels) * work
+        if not done and (self.points == "dense" or (self.points == "auto" and count <= MOST)):
+            times["points"] = core * _MATCHED * count * math.prod(matched_size(*size)) / pixels
+        times["training"] = step * _TRAINING * (config.iterations - done)
+        times["scores and page"] = step * _SHOWN * 3 * min(count, 8)
         parts = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in times.items())
         return f"This will take about {_duration(sum(times.values()))} on this machine as it is now: {parts}."
 

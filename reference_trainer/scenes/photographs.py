@@ -42,15 +42,14 @@ def sort_photographs(source: Path) -> tuple[list[Path], dict[str, str]]:
     folder = source / "images" if (source / "images").is_dir() else source
     files = [source] if source.is_file() else sorted(path for path in folder.iterdir() if path.name[0] != ".")
     files.sort(key=lambda path: path.suffix.lower() not in _AS_THEY_ARE)  # first choice of one that is there twice
-    usable, wrong, taken = list[Path](), dict[str, str](), set[str]()
+    usable, wrong = dict[str, Path](), dict[str, str]()
     for path in files:
         kind = path.suffix.lower()
-        if path.is_dir() or path.stem in taken:
+        if path.is_dir() or path.stem in usable:
             continue
         try:
             if is_video(path):
-                with _opened_video(path):
-                    pass
+                _opened_video(path).close()
             elif kind in HEIC:
                 _upright(path)
             elif is_image(path):
@@ -59,12 +58,10 @@ def sort_photographs(source: Path) -> tuple[list[Path], dict[str, str]]:
                 raise ValueError(f"{kind[1:].upper()} is not read: save it as JPEG or PNG")
             else:
                 continue
+            usable[path.stem] = path
         except (ValueError, OSError) as error:
             wrong[path.name] = str(error)
-            continue
-        usable.append(path)
-        taken.add(path.stem)
-    return sorted(usable), wrong
+    return sorted(usable.values()), wrong
 
 
 def collect_photographs(sources: Sequence[Path], folder: Path, frames: int = 16) -> list[str]:
