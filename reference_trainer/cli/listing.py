@@ -30,8 +30,8 @@ registry = ConstructorRegistry()
 def _options(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Return the fields of a dataclass of this package with their texts, those of a training in groups."""
     kind, default = info.type, info.default
-    made_here = kind.__module__ == __name__  # a group, of which tyro reads all it needs, and which has no source
-    if made_here or not (dataclasses.is_dataclass(kind) and kind.__module__.startswith("reference_trainer.")):
+    ours = dataclasses.is_dataclass(kind) and kind.__module__.startswith("reference_trainer.")
+    if not ours or kind.__module__ == __name__:  # a group, made below: it has no source, and tyro reads its fields
         return None
     given = vars(default) if isinstance(default, kind) else {}
     hints, texts = get_type_hints(kind, include_extras=True), _texts(kind)
