@@ -30,8 +30,9 @@ registry = ConstructorRegistry()
 def _options(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Return the fields of a dataclass of this package with their texts, those of a training in groups."""
     kind, default = info.type, info.default
-    ours = dataclasses.is_dataclass(kind) and kind.__module__.startswith("reference_trainer.")
-    if not ours or kind.__module__ == __name__:  # a group, made below: it has no source, and tyro reads its fields
+    if not (dataclasses.is_dataclass(kind) and kind.__module__.startswith("reference_trainer.")):
+        return None
+    if kind.__module__ == __name__:  # a group, made below: tyro reads its fields, and it has no source
         return None
     given = vars(default) if isinstance(default, kind) else {}
     hints, texts = get_type_hints(kind, include_extras=True), _texts(kind)
