@@ -226,8 +226,7 @@ def forward_signature(rasterizer: type) -> inspect.Signature:
     """Return the signature of a rasterizer's forward; raise TypeError if it lacks the family's arguments."""
     forward = getattr(rasterizer, "forward", None)
     signature = inspect.signature(forward) if callable(forward) else inspect.Signature()
-    missing = [name for name in ("means3D", "opacities") if name not in signature.parameters]
-    if missing:
+    if missing := [name for name in ("means3D", "opacities") if name not in signature.parameters]:
         raise TypeError(
             f"{rasterizer.__qualname__}.forward{signature} has no argument {' or '.join(missing)}, so it is no "
             "GaussianRasterizer of the INRIA family; pass the class of your code base as rasterizer=..."

@@ -6,7 +6,6 @@ import abc
 from collections import Counter
 from dataclasses import dataclass, field
 from enum import StrEnum
-from types import TracebackType
 from typing import Any, Self
 
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
@@ -128,12 +127,10 @@ class Hook(abc.ABC):
         """Install the hook unless it is installed."""
         return self.install() if self._handle is None else self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *of_error: object) -> None:
         """Uninstall the hook; raise a RuntimeError if training was not regularized, see :meth:`problem`."""
         self.uninstall()
-        if error is None and self._optimized and (problem := self.problem()):
+        if kind is None and self._optimized and (problem := self.problem()):
             raise RuntimeError(problem)
 
     def note_regularized(self) -> None:

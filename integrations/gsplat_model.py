@@ -75,16 +75,10 @@ class GsplatModel:
         Raises an ImportError without gsplat, a RuntimeError if the Gaussians are not on a CUDA device.
         """
         colors, alphas, _ = unregularized(load_gsplat(self.means.device).rasterization)(
-            **self._camera(view),
-            means=self.means,
-            quats=self.quats,
-            scales=self.scales,
+            **self._given(view),
             opacities=opacity.reshape(-1),
             colors=self.colors,
-            near_plane=self.near_plane,
-            eps2d=self.eps2d,
             sh_degree=self.sh_degree,
-            packed=False,
             backgrounds=None if self.background is None else self.background[None],
             rasterize_mode="antialiased" if self.antialiased else "classic",
         )
@@ -97,19 +91,9 @@ class GsplatModel:
         are those of :meth:`render`.
         """
         gsplat = load_gsplat(self.means.device)
-        camera = self._camera(view)
         flat = opacity.reshape(-1)
         radii, means2d, depths, conics, compensations = gsplat.fully_fused_projection(
-            **camera,
-            means=self.means,
-            covars=None,
-            quats=self.quats,
-            scales=self.scales,
-            eps2d=self.eps2d,
-            near_plane=self.near_plane,
-            packed=False,
-            calc_compensations=self.antialiased,
-            opacities=flat,
+            **self._given(view), covars=None, calc_compensations=self.antialiased, opacities=flat
         )
         opacities = flat[None] * compensations if self.antialiased else flat[None]
         with torch.no_grad():
@@ -123,9 +107,11 @@ class GsplatModel:
             gaussians, pixels, alphas, self._colors(gsplat, view), view.height, view.width, self.background
         )
 
-    def _camera(self, view: GsplatView) -> dict[str, Any]:
-        """Return the camera arguments that gsplat's functions share, for one camera."""
-        return {"viewmats": view.viewmat[None], "Ks": view.K[None], "width": view.width, "height": view.height}
+    def _given(self, view: GsplatView) -> dict[str, Any]:
+        """Return the arguments that gsplat's functions share, for one camera."""
+        camera = {"viewmats": view.viewmat[None], "Ks": view.K[None], "width": view.width, "height": view.height}
+        names = ("means", "quats", "scales", "near_plane", "eps2d")
+        return camera | {name: getattr(self, name) for name in names} | {"packed": False}
 
     def _colors(self, gsplat: Any, view: GsplatView) -> Tensor:
         """Return the view-dependent colors, (N, 3)."""

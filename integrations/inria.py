@@ -224,7 +224,6 @@ class RasterizerHook(Hook):
         return self._train(call, steps)
 
     def _leave(self, call: RasterizerCall, reason: Skip) -> Any:
-        """Make a call unchanged."""
         self.tally.skipped[reason] += 1
         return call()
 

@@ -140,7 +140,6 @@ class _Event:
         self._time = 0.0
 
     def record(self, stream: Any = None) -> None:
-        """Mark now."""
         self._time = time.perf_counter()
 
     def elapsed_time(self, end: _Event) -> float:
@@ -148,7 +147,6 @@ class _Event:
         return 1e3 * (end._time - self._time)
 
     def query(self) -> bool:
-        """Whether the work is done."""
         return True
 
     def wait(self, stream: Any = None) -> None:
@@ -182,7 +180,6 @@ class _Stream(_Context):
     """A stream of work; a CPU has only one."""
 
     def record_event(self, event: _Event | None = None) -> _Event:
-        """Mark now."""
         event = event or _Event()
         event.record(self)
         return event

@@ -105,7 +105,6 @@ class _View(NamedTuple):
 
 
 def _rasterize(given: SimpleNamespace, per_axis: bool) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Draw all cameras."""
     # The renderer's near plane is fixed; a change of the unit of length moves it, and leaves the picture as it is.
     unit = NEAR_PLANE / max(given.near_plane, NEAREST)
     means, scales = given.means * unit, given.scales * unit

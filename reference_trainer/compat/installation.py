@@ -89,8 +89,7 @@ def _installed(
     modules = {"fused_ssim": make_module("fused_ssim", fused_ssim=fused_ssim)}
     if repository is not None:
         modules = _modules(read_folder(Path(repository)), None if outputs is None else tuple(outputs), rasterizer)
-    present = [name for name in modules if name in sys.modules]
-    if present:
+    if present := [name for name in modules if name in sys.modules]:
         raise RuntimeError(
             f"{', '.join(present)} {'is' if len(present) == 1 else 'are'} imported already: start a new process, and "
             "install the stand-in before the repository is imported; or end an earlier one."

@@ -172,7 +172,7 @@ def _kind(name: str) -> str | None:
     return None if None in parts else "+".join(map(str, parts))
 
 
-_BETWEEN = ("torch", "ca_reg", __package__)  # packages whose frames lie between a caller and a stand-in
+_BETWEEN = ("torch.", "ca_reg.", f"{__package__}.")  # packages whose frames lie between a caller and a stand-in
 
 _Place = tuple[int | None, ...]  # first and last line and column of an expression
 
@@ -191,18 +191,13 @@ def names_of_results() -> tuple[str, ...] | None:
     """
     frame: FrameType | None = sys._getframe(1)
     # A hook of this package, or torch's call of a module, may stand between the caller and the rasterizer.
-    while frame is not None and _is_between(frame.f_globals.get("__name__", "")):
+    while frame is not None and f"{frame.f_globals.get('__name__')}.".startswith(_BETWEEN):
         frame = frame.f_back
     if frame is None:
         return None
     place = inspect.getframeinfo(frame, context=0).positions
     source = "".join(linecache.getlines(frame.f_code.co_filename, frame.f_globals))
     return None if place is None else _uses(source).get(tuple(place)) or None
-
-
-def _is_between(module: str) -> bool:
-    """Whether a module lies between caller and stand-in."""
-    return any(module == name or module.startswith(f"{name}.") for name in _BETWEEN)
 
 
 @functools.lru_cache(maxsize=64)

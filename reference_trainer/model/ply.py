@@ -145,8 +145,7 @@ def load_ply(path: str | Path) -> PlyModel:
     properties, columns = vertices.kinds, vertices.columns
     rest = [f"f_rest_{index}" for index in range(sum(name.startswith("f_rest_") for name in properties))]
     required = (*_MEANS, *_DC, *rest, "opacity", *_SCALES, *_ROTATIONS)
-    missing = [name for name in required if name not in properties]
-    if missing:
+    if missing := [name for name in required if name not in properties]:
         raise ValueError(f"{path} is not a 3D Gaussian Splatting PLY: its vertices lack {', '.join(missing)}.")
     if len(rest) not in (0, 9, 24, 45):
         raise ValueError(f"{path} has {len(rest)} f_rest properties; degrees 0 to 3 have 0, 9, 24 or 45.")

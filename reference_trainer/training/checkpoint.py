@@ -118,7 +118,6 @@ def _read(state: dict[str, Any], scene: Scene, where: Path, refuse: Callable[[Tr
 def _read_model(
     state: dict[str, Any], config: TrainConfig, scene: Scene, step: int, number: int, where: str
 ) -> dict[str, Any]:
-    """Read the state of one of the models."""
     _refuse_other_entries(state, _OF_A_MODEL, where)
     tensors, moments = state["gaussians"], state["moments"]
     parameters = [*PARAMETERS, *make_regularizer(config).learns]
@@ -152,7 +151,6 @@ def _read_model(
 
 
 def _config(text: Any, where: Path) -> TrainConfig:
-    """Read the settings."""
     if type(text) is not str:
         raise ValueError(f"{where} is a damaged checkpoint: config must be JSON, got {type(text).__name__}.")
     try:

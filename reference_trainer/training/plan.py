@@ -64,11 +64,8 @@ class Plan:
         changing = [item for item in self.items if item.changes]
         changes = [f"{name}={value} ({item.reason})" for item in changing for name, value in item.changes.items()]
         what = f"{len(changes)} setting{'s' * (len(changes) != 1)}: {'; '.join(changes)}" if changes else "no setting"
-        lines = [f"Training changes {what}."]
-        for item in self.items:
-            if item.name == "dropout":
-                lines.append(f"Dropout is {item.decision}: {item.reason}.")
-        return "\n".join(lines)
+        dropout = [f"Dropout is {item.decision}: {item.reason}." for item in self.items if item.name == "dropout"]
+        return "\n".join([f"Training changes {what}.", *dropout])
 
     def rows(self) -> list[dict[str, object]]:
         """Return one row per item, for a table with the columns item, decision, change and reason."""
@@ -99,8 +96,7 @@ def make_plan(
         >>> {item.name: item.decision for item in plan.items}["depth output"]
         'left out'
     """
-    unknown = set(given) - {f.name for f in dataclasses.fields(TrainConfig)}
-    if unknown:
+    if unknown := set(given) - {f.name for f in dataclasses.fields(TrainConfig)}:
         raise ValueError(f"given must name fields of TrainConfig, got {sorted(unknown)}.")
     check(config)
     kept = _kept(config, given)

@@ -46,9 +46,8 @@ def sh_bands(scene: Scene, config: TrainConfig) -> PlanItem:
     if config.sh_degree == 0:
         return PlanItem(name, "left out", "asked for (sh_degree=0)")
     if scene.start is not None:
-        return PlanItem(
-            name, "used", f"all from the first step on: training starts from degree {scene.start.sh_degree}"
-        )
+        reason = f"all from the first step on: training starts from degree {scene.start.sh_degree}"
+        return PlanItem(name, "used", reason)
     reached = config.sh_degree_at(config.iterations)
     if reached < config.sh_degree:
         reason = f"bands above degree {reached} would begin after the last step, {config.iterations}, and stay 0"
@@ -81,8 +80,7 @@ def background(scene: Scene, config: TrainConfig) -> PlanItem:
 
 def depth_output(scene: Scene, config: TrainConfig) -> PlanItem:
     """Depth is drawn only if a term of the loss needs it."""
-    asking = _terms_that_need("depth", config)
-    if asking:
+    if asking := _terms_that_need("depth", config):
         return PlanItem("depth output", "used", f"asked for: {asking} looks at it")
     return PlanItem("depth output", "left out", "by construction: no term of the loss looks at depth")
 
@@ -177,8 +175,7 @@ def guarding(scene: Scene, config: TrainConfig) -> PlanItem:
 
 def regularizer_inputs(scene: Scene, config: TrainConfig) -> PlanItem:
     """What the regularizers need besides the opacities."""
-    needed = ", ".join(make_regularizer(config).needs)
-    if needed:
+    if needed := ", ".join(make_regularizer(config).needs):
         return PlanItem("inputs of the regularizers", "used", f"asked for: they need {needed}")
     reason = "by construction: they look at opacities alone, so neither neighbors nor depths are computed"
     return PlanItem("inputs of the regularizers", "left out", reason)
@@ -217,8 +214,7 @@ def moments(scene: Scene, config: TrainConfig) -> PlanItem:
     """Exact mean and variance over masks."""
     if config.analytic:
         return PlanItem("moments", "used", "asked for (analytic): every step trains on the expectation")
-    asking = _terms_that_need("moments", config)
-    if asking:
+    if asking := _terms_that_need("moments", config):
         return PlanItem("moments", "used", f"asked for: {asking} renders them")
     return PlanItem("moments", "left out", "by construction: a step needs none; the monitor measures at its own steps")
 

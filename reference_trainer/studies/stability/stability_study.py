@@ -102,7 +102,6 @@ def relative_error(measured: Tensor, reference: Tensor) -> float:
 
 
 def _point(case: Case, magnitude: float) -> Record:
-    """Run a case at a magnitude."""
     probe, status, errors, wrong, message = case.probe(magnitude), "ok", {}, [], ""
     try:
         measured = probe.measured()

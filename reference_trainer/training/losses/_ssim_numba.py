@@ -10,6 +10,7 @@ from torch import Tensor
 
 from reference_trainer.compiled.compiling import kernel
 from reference_trainer.compiled.threads import in_threads
+from reference_trainer.training.losses._ssim_constants import C1, C2, WEIGHTS
 
 __all__ = ["blur", "similarity"]
 
@@ -43,14 +44,11 @@ def _blur(first: int, last: int, maps: Array, weights: Array, blurred: Array) ->
                 out[x] = inner + w5 * (down[x] + down[x + 10])
 
 
-def blur(maps: Tensor, weights: list[float]) -> Tensor:
-    """Blur images (..., H, W), float32 on the CPU, with a symmetric separable window, zeros beyond the border.
-
-    The weights are those of the window's center and of the pixels to one side of it.
-    """
+def blur(maps: Tensor) -> Tensor:
+    """Blur images (..., H, W), float32 on the CPU, with the window of SSIM, zeros beyond the border."""
     images = maps.contiguous().view(-1, *maps.shape[-2:])
     blurred = torch.empty_like(images)
-    in_threads(_blur, images.shape[0], images.numpy(), np.array(weights, f4), blurred.numpy(), least=1)
+    in_threads(_blur, images.shape[0], images.numpy(), np.array(WEIGHTS, f4), blurred.numpy(), least=1)
     return blurred.view(maps.shape)
 
 
@@ -76,15 +74,14 @@ def _similarity(first: int, last: int, blurred: Array, c1: float, c2: float, res
         slopes[2, i] = two * weight * a1
 
 
-def similarity(blurred: Tensor, c1: float, c2: float) -> tuple[Tensor, Tensor]:
+def similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
     """Return SSIM (C, H, W), and its derivatives (3, C, H, W) by the blurred x, x^2 + y^2 and x y.
 
-    ``blurred`` holds x, y, x y and x^2 + y^2, float32 on the CPU, (4, C, H, W); ``c1`` is added to the means, ``c2`` to
-    the variances.
+    ``blurred`` holds x, y, x y and x^2 + y^2, float32 on the CPU, (4, C, H, W).
     """
     result, slopes = torch.empty_like(blurred[0]), torch.empty_like(blurred[:3])
     pixels = result.numel()
     arrays = (slopes.view(3, pixels), result.view(pixels), blurred.contiguous().view(4, pixels))
     of_slopes, of_result, of_blurred = (x.numpy() for x in arrays)
-    in_threads(_similarity, pixels, of_blurred, c1, c2, of_result, of_slopes, least=4096)
+    in_threads(_similarity, pixels, of_blurred, C1, C2, of_result, of_slopes, least=4096)
     return result, slopes

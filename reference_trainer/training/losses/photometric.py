@@ -186,7 +186,7 @@ def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
     if engine_for(blurred.device, blurred.dtype).name == "numba":
         from reference_trainer.training.losses._ssim_numba import similarity
 
-        return similarity(blurred, C1, C2)
+        return similarity(blurred)
     mean_x, mean_y, mean_xy, mean_squares = blurred
     product, squares = mean_x * mean_y, torch.addcmul(mean_x * mean_x, mean_y, mean_y)
     a1, a2 = 2 * product + C1, (mean_xy - product).mul_(2).add_(C2)
@@ -202,7 +202,7 @@ def _blur(maps: Tensor) -> Tensor:
     if engine_for(maps.device, maps.dtype).name == "numba":
         from reference_trainer.training.losses._ssim_numba import blur
 
-        return blur(maps, WEIGHTS)
+        return blur(maps)
     # Sums of shifted slices: on a CPU faster than a depthwise convolution, whose speed depends on the memory layout.
     center, *sides = WEIGHTS
     for axis in (-2, -1):
