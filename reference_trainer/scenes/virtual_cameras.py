@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from typing import Literal, get_args
 
 import torch
@@ -19,8 +20,9 @@ from reference_trainer.scenes.options import World
 from reference_trainer.scenes.scene import Scene, Viewpoint
 
 __all__ = [
-    "VIRTUAL_VIEWS", "BoundingSphere", "CameraPath", "bounding_sphere", "camera_between", "cameras_between",
-    "depth_bounds", "interpolate_cameras", "look_at", "measured_views", "orbit_views", "pseudo_cameras", "unseen_views",
+    "VIRTUAL_VIEWS", "BoundingSphere", "CameraPath", "amid_views", "bounding_sphere", "camera_between",
+    "cameras_between", "depth_bounds", "interpolate_cameras", "look_at", "measured_views", "orbit_views",
+    "pseudo_cameras", "unseen_views",
 ]  # fmt: skip
 
 _log = logging.getLogger(__name__)
@@ -37,6 +39,9 @@ INSIDE = 0.98
 SURROUNDINGS = 3.0
 """A model is an object with surroundings if the radius around its median point that holds `INSIDE` of the opacity is
 more than this many times the radius that holds half: 1.6 to 1.9 for objects (a plant, a mesh, lego), 5 for fern."""
+
+NEIGHBORS = 3
+"""Of a training camera, amid which there is a camera that nobody took."""
 
 MOST_UNSEEN = 60
 """Cameras that nobody took, at most: a hundred photographs have 1,350, which would cost the guard hours on a CPU."""
@@ -373,3 +378,29 @@ def unseen_views(scene: Scene) -> list[Viewpoint]:
     chosen = torch.linspace(0, len(ways) - 1, min(len(ways), MOST_UNSEEN)).round().int().tolist()
     some = [ways[number] for number in chosen]
     return [Viewpoint(name, camera_between(cameras[i], cameras[j], along, "arc")) for name, i, j, along in some]
+
+
+def amid_views(scene: Scene) -> list[Viewpoint]:
+    """Return cameras that nobody took amid neighbors of more than three training cameras; of fewer, none.
+
+    They stand amid every training camera and two of its `NEIGHBORS` nearest: a third of the way from the middle of the
+    first two to the last. Of more than `MOST_UNSEEN` so many are returned, spread evenly.
+
+    Example:
+        >>> from reference_trainer.scenes import synthetic_scene
+        >>> [view.name for view in amid_views(synthetic_scene(width=32, height=24, points=50, train_views=4))][:1]
+        ['amid train_0, train_1 and train_2']
+    """
+    cameras, names = [view.camera for view in scene.train], [view.name for view in scene.train]
+    if len(cameras) <= 3:  # the ways between them cover all there is
+        return []
+    positions = torch.stack([camera.position for camera in cameras])
+    near = nearest_neighbors(positions, min(NEIGHBORS, len(cameras) - 1))[1].tolist()
+    triples = sorted({tuple(sorted((i, *pair))) for i, of in enumerate(near) for pair in combinations(of, 2)})
+    chosen = torch.linspace(0, len(triples) - 1, min(len(triples), MOST_UNSEEN)).round().int().tolist()
+    found = []
+    for i, j, k in (triples[number] for number in chosen):
+        middle = camera_between(cameras[i], cameras[j], 0.5, "arc")
+        amid = camera_between(middle, cameras[k], 1 / 3, "arc")
+        found.append(Viewpoint(f"amid {names[i]}, {names[j]} and {names[k]}", amid))
+    return found

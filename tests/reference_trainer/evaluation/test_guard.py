@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from ca_reg import attribute
+from reference_trainer.camera import Camera
 from reference_trainer.evaluation import shares as shares_module
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.shares import guard, unseen_shares
@@ -17,7 +18,7 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.scene import Scene, Viewpoint
-from reference_trainer.scenes.virtual_cameras import MOST_UNSEEN, unseen_views
+from reference_trainer.scenes.virtual_cameras import MOST_UNSEEN, amid_views, unseen_views
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.model_state import initial_gaussians, seen_by_any
 from reference_trainer.training.plan import make_plan
@@ -32,13 +33,13 @@ def scene() -> Scene:
     return synthetic_scene(width=64, height=48, points=1_500)
 
 
-def veil(scene: Scene, count: int = 12) -> Gaussians:
+def veil(scene: Scene, count: int = 12, camera: Camera | None = None, near: float = 1.0) -> Gaussians:
     """Opaque Gaussians close before the view outside, in no picture of the training, in the colors of nothing there."""
-    camera = scene.test[OUTSIDE].camera
-    size = 0.03
+    camera = camera or scene.test[OUTSIDE].camera
+    size = 0.03 * near
     pixels = torch.cartesian_prod(torch.arange(4.0, camera.width, 2), torch.arange(4.0, camera.height, 2))
     for depth in (0.8, 1.0, 1.3, 1.6):
-        places = camera.lift(pixels, torch.full((len(pixels),), depth))
+        places = camera.lift(pixels, torch.full((len(pixels),), near * depth))
         colors = torch.tensor([[0.0, 1.0, 0.0]]).expand(len(places), 3)
         made = Gaussians.from_points(places, colors, torch.full((len(places),), size), sh_degree=3)
         made = replace(made, opacity_logits=torch.full_like(made.opacity_logits, 4.0))
@@ -215,6 +216,44 @@ def test_many_photographs_have_no_more_cameras_nobody_took_than_a_guard_can_look
               for kind in ("between", "beyond")}  # fmt: skip
     for of in places.values():
         assert max(b - a for a, b in pairwise([0, *sorted(of), 39])) <= 4  # everywhere along the row
+
+
+def zigzag(count: int) -> Scene:
+    """The built-in scene with so many training cameras, each second one raised."""
+    scene = synthetic_scene(width=64, height=48, points=1_500, train_views=count)
+    for view in scene.train[1::2]:
+        view.camera.world_to_camera[1, 3] += 1.0
+    return scene
+
+
+def test_what_hangs_at_one_of_many_places_is_found(monkeypatch):
+    """Amid three cameras, off the ways between them, where the mean over all places hardly knows of it."""
+    scene = zigzag(9)
+    start = initial_gaussians(scene, TrainConfig())
+    start = replace(start, opacity_logits=torch.full_like(start.opacity_logits, 2.0))
+    places = amid_views(scene)
+    planted = veil(scene, 6, places[len(places) // 2].camera, near=0.3)
+    model = TrainedModel(together(start, planted), scene.background, "dropout(0.2)")
+    found = guard(model, scene, rounds=1)
+    assert (~found.keep).nonzero()[:, 0].tolist() == [*range(len(start), len(start) + len(planted))]
+    assert found.where == {places[len(places) // 2].name: len(planted)}
+    monkeypatch.setattr(shares_module, "amid_views", lambda scene: [])
+    assert guard(model, scene, rounds=1).keep.all()
+
+
+def test_cameras_amid_three_neighbors_stand_between_them():
+    scene = zigzag(6)
+    assert amid_views(replace(scene, train=scene.train[:3])) == []
+    views, by_name = amid_views(scene), {view.name: view.camera for view in scene.train}
+    assert len({view.name for view in views}) == len(views) > 4
+    for view in views:
+        three = [by_name[name] for name in view.name.removeprefix("amid ").replace(" and ", ", ").split(", ")]
+        middle = torch.stack([camera.position for camera in three]).mean(0)
+        apart = max((camera.position - middle).norm() for camera in three)
+        assert (view.camera.position - middle).norm() < 0.3 * apart
+        for axis in range(3):  # not turned more than they are
+            turns = [camera.world_to_camera[axis, :3] for camera in three]
+            assert min(view.camera.world_to_camera[axis, :3] @ turn for turn in turns) > 0.9
 
 
 def test_nothing_but_the_veil_goes(scene):
