@@ -202,7 +202,7 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
     results = read_json(run / "results.json")
     name = Path(options.path).name
     row: Row = {"scene": _scene(options), "candidate": candidate(config), "seed": config.seed}
-    if name in HELD_OUT and row["candidate"].removesuffix(f", {LATER}") not in _REFERENCES:
+    if (name in HELD_OUT or name.endswith("-many")) and row["candidate"].removesuffix(f", {LATER}") not in _REFERENCES:
         row["held-out"] = fmean(quality(model, view) for view in _held_out(options, config.seed))
     test, metric = results["mean"]["test"], results.get("perceptual_metric")
     if metric is None and perceptual is not None:
@@ -496,7 +496,7 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
 def _scene(options: SceneOptions) -> str:
     """Return the name of a scene, with its points where these are others than the scene's own."""
     start = STARTS.get(options.points)
-    return Path(options.path).name + (f", {start}" if start else "")  # with many photographs, the folder's name says so
+    return Path(options.path).name + (f", {start}" if start else "")
 
 
 def _from_dense(scene: str) -> str:

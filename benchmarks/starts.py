@@ -18,10 +18,10 @@ import numpy as np
 from benchmarks.paper.rows import value
 from benchmarks.paper.scenes import SCENES
 from benchmarks.setting import CHOSEN, FEW_AND_RANDOM, LATER, Row, rows_of
-from benchmarks.start_scenes import OTHER, SIFT
+from benchmarks.start_scenes import MANY, OTHER, SIFT
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
-__all__ = ["choice", "judgement", "own_cameras", "tables"]
+__all__ = ["choice", "judgement", "many", "own_cameras", "tables"]
 
 CHOOSING = ("fern", "herz-jesu", "fountain", "sceaux", "cape", "dtu-scan65")
 """The scenes whose held-out views choose a start."""
@@ -85,6 +85,31 @@ def own_cameras(rows: Sequence[Row]) -> str:
     return markdown_table(lines, [*lines[0]]) if lines else "Nothing was trained with cameras of its own."
 
 
+def many(rows: Sequence[Row]) -> str:
+    """Return the table of trainings with 14 and 16 photographs: PSNR of held-out and test views, and the gains."""
+    lines, every = [], list[tuple[float, float]]()
+    for scene in MANY:
+        names = ("measured" if scene in SIFT else "random points", "dense and measured")
+        before, after = (rows_of(rows, f"{scene}-many, {name}", LATER) for name in names)
+        if shared := sorted(before.keys() & after.keys()):
+            pairs = [[np.mean([_figures(of[seed]) for seed in shared], 0) for of in (before, after)]]
+            gains = [np.subtract(_figures(after[seed]), _figures(before[seed])) for seed in shared]
+            every.append(tuple(np.mean(gains, 0)))
+            line = {"scene": scene, "photographs": str(MANY[scene]), "points": names[0]}
+            line |= {
+                title: "{:.2f} / {:.2f}".format(*x) for title, x in zip(("as now", "dense start"), *pairs, strict=True)
+            }
+            line["gain, by seed"] = ", ".join("{:+.2f} / {:+.2f}".format(*gain) for gain in gains)
+            line["Gaussians"] = " / ".join(
+                f"{np.mean([of[seed]['gaussians'] for seed in shared]):,.0f}" for of in (before, after)
+            )
+            lines.append(line)
+    if not lines:
+        return "Nothing was trained with more than ten photographs."
+    mean = "- mean gain at held-out / test views: {:+.2f} / {:+.2f} dB".format(*np.mean(every, 0))
+    return "\n".join([markdown_table(lines, [*lines[0]]), "", mean])
+
+
 def tables(rows: Sequence[Row]) -> list[str]:
     """Return all tables of the page that come from trainings."""
     few = [FEW_AND_RANDOM, "dense", "dense and few", "dense, few and random"]
@@ -94,6 +119,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
         choice(rows, ["other", "dense and other"]),
         judgement(rows, "dense and few"),
         own_cameras(rows),
+        many(rows),
     ]
 
 

@@ -22,7 +22,9 @@ from reference_trainer.progress import progress_bar
 from reference_trainer.scenes.images import resize_image
 from reference_trainer.scenes.scene import PointCloud, View
 
-__all__ = ["ENOUGH", "MOST", "SOURCE", "dense_points", "dense_start", "matched_size", "source_views"]
+__all__ = [
+    "ENOUGH", "MOST", "MOST_IF_RANDOM", "SOURCE", "dense_points", "dense_start", "matched_size", "source_views",
+]  # fmt: skip
 
 SOURCE = "dense stereo"
 """What such a cloud names as its `source`."""
@@ -31,6 +33,7 @@ COUNT = 15_000
 LEAST = 1_000
 ENOUGH = 10_000  # measured points, to which none are added unasked
 MOST = 10  # photographs to measure on unasked: each takes five seconds of a core
+MOST_IF_RANDOM = 16  # the same where so few points are measured that random ones would be added
 PIXELS = 200_000  # larger photographs are made smaller: more pixels take longer and add no points
 ENLARGED = 1.4  # and smaller ones larger: the windows, of a fixed number of pixels, then cover finer detail
 SPACING, PLANES = 0.7, 192  # pixels of motion from plane to plane, and their largest number

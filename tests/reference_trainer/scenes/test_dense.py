@@ -269,12 +269,19 @@ def test_where_a_dense_start_finds_nothing_random_points_are_taken_and_it_is_not
         assert len(load_scene(options).points.positions) == number + random
 
 
-def test_of_many_photographs_a_dense_start_must_be_asked_for(tmp_path, cache):
-    written(tmp_path / "scene", plane(*np.linspace(-0.5, 0.5, 11).tolist()))
-    few_points(tmp_path / "scene", 99)
+@pytest.mark.parametrize(("photographs", "measured", "random"), [(11, 1_000, 0), (17, 99, 10_000)])
+def test_of_many_photographs_a_dense_start_must_be_asked_for(tmp_path, cache, photographs, measured, random):
+    written(tmp_path / "scene", plane(*np.linspace(-0.5, 0.5, photographs).tolist()))
+    few_points(tmp_path / "scene", measured)
     scene = load_scene(SceneOptions(str(tmp_path / "scene"), test="none"))
-    assert len(scene.points.positions) == 99 + 10_000
+    assert len(scene.points.positions) == measured + random
     assert not cache.exists()
+
+
+def test_of_sixteen_photographs_it_takes_the_place_of_random_points(tmp_path, cache):
+    written(tmp_path / "scene", plane(*np.linspace(-0.5, 0.5, 16).tolist()))
+    few_points(tmp_path / "scene", 99)
+    assert "dense stereo, and 99 from" in str(load_scene(SceneOptions(str(tmp_path / "scene"), test="none")))
 
 
 @pytest.mark.slow
