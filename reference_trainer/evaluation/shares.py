@@ -98,8 +98,8 @@ def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None =
     """Find the Gaussians that hang where nobody took a photograph, see `ca_reg.attribution.hanging`.
 
     What hangs is left out and the rest measured again, because it may have hidden more, until nothing hangs or
-    ``rounds`` are over. All `unseen_views` are judged together; with more than three training cameras each of
-    `amid_views` by itself as well, because what hangs at one of many places is little in the mean over all. Scores are
+    ``rounds`` are over. All `unseen_views` are judged together; of many training cameras each of `amid_views`
+    by itself as well, because what hangs at one of many places is little in the mean over all. Scores are
     those of the drop rate of the training, or of 0.2 after noise. No photograph is looked at. Costs about four renders
     per camera and round.
 

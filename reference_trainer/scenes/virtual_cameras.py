@@ -40,6 +40,9 @@ SURROUNDINGS = 3.0
 """A model is an object with surroundings if the radius around its median point that holds `INSIDE` of the opacity is
 more than this many times the radius that holds half: 1.6 to 1.9 for objects (a plant, a mesh, lego), 5 for fern."""
 
+FEW_CAMERAS = 10
+"""Training cameras, at most, between and beyond which the `unseen_views` are enough."""
+
 NEIGHBORS = 3
 """Of a training camera, amid which there is a camera that nobody took."""
 
@@ -381,18 +384,18 @@ def unseen_views(scene: Scene) -> list[Viewpoint]:
 
 
 def amid_views(scene: Scene) -> list[Viewpoint]:
-    """Return cameras that nobody took amid neighbors of more than three training cameras; of fewer, none.
+    """Return cameras that nobody took amid neighbors of more than `FEW_CAMERAS` training cameras; of fewer, none.
 
     They stand amid every training camera and two of its `NEIGHBORS` nearest: a third of the way from the middle of the
     first two to the last. Of more than `MOST_UNSEEN` so many are returned, spread evenly.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
-        >>> [view.name for view in amid_views(synthetic_scene(width=32, height=24, points=50, train_views=4))][:1]
-        ['amid train_0, train_1 and train_2']
+        >>> amid_views(synthetic_scene(width=32, height=24, points=50, train_views=11))[0].name
+        'amid train_0, train_1 and train_2'
     """
     cameras, names = [view.camera for view in scene.train], [view.name for view in scene.train]
-    if len(cameras) <= 3:  # the ways between them cover all there is
+    if len(cameras) <= FEW_CAMERAS:
         return []
     positions = torch.stack([camera.position for camera in cameras])
     near = nearest_neighbors(positions, min(NEIGHBORS, len(cameras) - 1))[1].tolist()

@@ -228,7 +228,7 @@ def zigzag(count: int) -> Scene:
 
 def test_what_hangs_at_one_of_many_places_is_found(monkeypatch):
     """Amid three cameras, off the ways between them, where the mean over all places hardly knows of it."""
-    scene = zigzag(9)
+    scene = zigzag(11)
     start = initial_gaussians(scene, TrainConfig())
     start = replace(start, opacity_logits=torch.full_like(start.opacity_logits, 2.0))
     places = amid_views(scene)
@@ -242,8 +242,8 @@ def test_what_hangs_at_one_of_many_places_is_found(monkeypatch):
 
 
 def test_cameras_amid_three_neighbors_stand_between_them():
-    scene = zigzag(6)
-    assert amid_views(replace(scene, train=scene.train[:3])) == []
+    scene = zigzag(11)
+    assert amid_views(replace(scene, train=scene.train[:10])) == []
     views, by_name = amid_views(scene), {view.name: view.camera for view in scene.train}
     assert len({view.name for view in views}) == len(views) > 4
     for view in views:
