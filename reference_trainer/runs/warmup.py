@@ -77,7 +77,8 @@ def _use_everything() -> None:
     """Take one training step of each kind and compute each score on a scene of a few pixels."""
     scene = synthetic_scene(width=8, height=6, points=20)
     plain = TrainConfig(iterations=1, dropout=0.2)
-    for config in (plain, replace(plain, analytic=True), replace(plain, density="absgrad")):
+    kinds = {"analytic": True}, {"density": "absgrad"}, {"loss": "photometric + smooth_depth(0.001)"}
+    for config in (plain, *(replace(plain, **kind) for kind in kinds)):
         trainer = Trainer(scene, config)
         trainer.train_step()
     model, view = model_of(trainer), trainer.views[0]
