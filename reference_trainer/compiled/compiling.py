@@ -53,7 +53,7 @@ _DIGEST = _digest()
 def describe_compilation(folder: str | None) -> str:
     """Describe for people what happens when a loop must be compiled, to be cached in a folder, or nowhere."""
     when = "once on this machine" if folder else "in every process, as no folder can be written (set NUMBA_CACHE_DIR)"
-    return f"Compiling the renderer's loops, {when}: about 20 s of one core."
+    return f"Compiling the renderer's loops, {when}: about 30 s of one core."
 
 
 @functools.cache

@@ -118,7 +118,7 @@ def test_it_says_so_once(caplog, monkeypatch, folder, loaded):
     compiling._log("a", "/cache")
     compiling._log("b", "/another cache")
     assert [record.getMessage() for record in caplog.records] == [
-        "Compiling the renderer's loops, once on this machine: about 20 s of one core."
+        "Compiling the renderer's loops, once on this machine: about 30 s of one core."
     ]
     compiling._log("a", None)
     assert "in every process, as no folder can be written (set NUMBA_CACHE_DIR)" in caplog.text
