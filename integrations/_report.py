@@ -6,6 +6,7 @@ import abc
 from collections import Counter
 from dataclasses import dataclass, field
 from enum import StrEnum
+from types import TracebackType
 from typing import Any, Self
 
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
@@ -127,10 +128,12 @@ class Hook(abc.ABC):
         """Install the hook unless it is installed."""
         return self.install() if self._handle is None else self
 
-    def __exit__(self, kind: type[BaseException] | None, *of_error: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Uninstall the hook; raise a RuntimeError if training was not regularized, see :meth:`problem`."""
         self.uninstall()
-        if kind is None and self._optimized and (problem := self.problem()):
+        if error is None and self._optimized and (problem := self.problem()):
             raise RuntimeError(problem)
 
     def note_regularized(self) -> None:

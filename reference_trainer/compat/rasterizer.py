@@ -6,7 +6,7 @@ import functools
 import warnings
 from collections.abc import Callable, Iterable
 from types import ModuleType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +21,8 @@ from reference_trainer.render.constants import DILATION
 from reference_trainer.render.densification import in_front, splat_weights, visible_radii, with_absolute_gradients
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "camera_of", "rasterizer_module"]
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 TOLERANCE = 1e-3  # of the entries of a projection matrix that went through single precision twice
 ROUNDING = 1e-6  # of what is 0 there, but is a difference of numbers as large as the camera is far from the origin
@@ -131,7 +133,7 @@ FLOOR = 2.5e-5  # least ratio of determinants in INRIA's antialiasing
 FLOOR_OF_MIP = 1e-6  # the same in Mip-Splatting
 
 
-def _without_autocast(method: Callable[..., Any]) -> Callable[..., Any]:
+def _without_autocast(method: F) -> F:
     """Let a method of a rasterizer compute in the precision of its arguments, as CUDA code does."""
 
     @functools.wraps(method)
@@ -139,7 +141,7 @@ def _without_autocast(method: Callable[..., Any]) -> Callable[..., Any]:
         with torch.autocast(self.raster_settings.viewmatrix.device.type, enabled=False):
             return method(self, *args, **kwargs)
 
-    return precise
+    return cast("F", precise)
 
 
 class GaussianRasterizer(nn.Module):

@@ -37,7 +37,11 @@ class ErrorMaps:
     depth, and what they differ by, over what the sum of features expects there, is the unit of the maps.
 
     For each training view this takes what a map takes, and a render; for each view two renders, a pass of moments, and
-    the warps. Without training views the maps come from the model alone.
+    the warps.
+
+    Args:
+        model: which, on the views' device.
+        train: its training views; without any, the maps come from the model alone.
 
     Example:
         >>> from reference_trainer.model.gaussians import Gaussians
@@ -50,14 +54,16 @@ class ErrorMaps:
 
     @torch.no_grad()
     def __init__(self, model: TrainedModel, train: Sequence[View] = ()) -> None:
-        self.model, self.unit = model, 1.0
+        self.model = model
         self._photographs: list[tuple[Camera, Tensor]] = []  # with depth in a fourth channel
-        self._train = [view.to(model.background.device) for view in train]
+        self._train, self.unit = [view.to(model.background.device) for view in train], 1.0
+        if not train:
+            return
         for view in self._train:
             depth = _depth(model.test_rendering(view, depth=True))
             self._photographs.append((view.camera, torch.cat([view.image, depth[None]])))
         measured = expected = 0.0
-        for number in range(0, len(train), -(-len(train) // NEAREST) or 1):
+        for number in range(0, len(train), -(-len(train) // NEAREST)):
             difference, features = self.left_out(number)
             shown = features["hidden"] == 0
             measured += difference.sum().item()
