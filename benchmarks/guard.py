@@ -2,6 +2,7 @@
 
     python -m benchmarks.guard measure RUN... --out rules.json    # folders of runs; what is measured is kept
     python -m benchmarks.guard table rules.json
+    python -m benchmarks.guard places RUN...                      # each place judged by itself
 
 A row is a model under a rule: PSNR at the test views, at the training views and at held-out views of training kind,
 which alone choose; how many Gaussians went, and the exact score where nobody was, before and after.
@@ -15,6 +16,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated, Any, Literal
 
 import torch
@@ -31,9 +33,9 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
-from reference_trainer.scenes.virtual_cameras import unseen_views
+from reference_trainer.scenes.virtual_cameras import amid_views, unseen_views
 
-__all__ = ["RULES", "keeps", "main"]
+__all__ = ["RULES", "by_place", "keeps", "main"]
 
 RULES: dict[str, dict[str, Any]] = {
     "ratio 2, 0.3 %": {"ratio": 2.0, "alone": 0.003},
@@ -56,7 +58,7 @@ _SPLITS = ("held-out", "test", "train")
 
 
 def main(
-    what: Annotated[Literal["measure", "table"], tyro.conf.Positional],
+    what: Annotated[Literal["measure", "table", "places"], tyro.conf.Positional],
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
     out: Path = Path("runs/guard.json"),
     rules: tuple[str, ...] = tuple(RULES),
@@ -64,7 +66,7 @@ def main(
     """Measure runs under every rule, or print tables of what was measured.
 
     Args:
-        what: "measure", or "table".
+        what: "measure"; "table"; or "places", for what judging each place by itself changes.
         paths: folders of runs, or files of rows.
         out: the file of rows, which is continued.
         rules: those to measure.
@@ -72,6 +74,10 @@ def main(
     torch.set_num_threads(1)
     if what == "table":
         print("\n\n".join(table(json.loads(path.read_text("utf-8"))) for path in paths))
+        return
+    if what == "places":
+        for run in paths:
+            print(run.name, by_place(run), sep=": ", flush=True)
         return
     rows = json.loads(out.read_text("utf-8")) if out.exists() else []
     for run in paths:
@@ -155,6 +161,39 @@ def keeps(
         where.update(views[i].name for i in where_highest[hang].tolist())
         keep[keep.clone()] = ~hang
     return keep, scores, dict(where)
+
+
+@torch.no_grad()
+def by_place(run: Path, rounds: int = 3) -> str:
+    """Return what changes if each place is judged by itself, amid 3 and 4 neighbors or, of few cameras, on their ways.
+
+    PSNR at held-out / test views, dB, and how many Gaussians go in each round.
+    """
+    model, scene = load_run_model(run)
+    options, config = read_run_settings(run / "config.json")
+    others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(scene.name, ())]
+
+    def figures(keep: Tensor) -> Tensor:
+        rest = replace(model, gaussians=model.gaussians[keep])
+        return torch.tensor([fmean(quality(rest, view) for view in of) for of in (others, scene.test)])
+
+    before = figures(torch.ones(len(model.gaussians), dtype=torch.bool))
+    found = ["{:.2f} / {:.2f}".format(*before.tolist())]
+    for places in (
+        [amid_views(scene, neighbors) for neighbors in (3, 4)] if amid_views(scene) else [unseen_views(scene)]
+    ):
+        start, keep, removed = time.process_time(), torch.ones(len(model.gaussians), dtype=torch.bool), list[int]()
+        while len(removed) < rounds and (not removed or removed[-1]):
+            rest = replace(model, gaussians=model.gaussians[keep])
+            here = blend_weights(rest.without_camera, scene.train) / 3  # as if three photographs had been taken
+            hang = torch.zeros(len(rest.gaussians), dtype=torch.bool)
+            for place in places:
+                hang |= hanging(unseen_shares(rest, [place])[0], blend_weights(rest.without_camera, [place]), here)
+            removed.append(int(hang.sum()))
+            keep[keep.clone()] = ~hang
+        took = time.process_time() - start
+        found.append("{:+.2f} / {:+.2f}".format(*(figures(keep) - before).tolist()) + f" {removed} {took:.0f} s")
+    return ", ".join(found)
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

@@ -383,11 +383,11 @@ def unseen_views(scene: Scene) -> list[Viewpoint]:
     return [Viewpoint(name, camera_between(cameras[i], cameras[j], along, "arc")) for name, i, j, along in some]
 
 
-def amid_views(scene: Scene) -> list[Viewpoint]:
+def amid_views(scene: Scene, neighbors: int = NEIGHBORS) -> list[Viewpoint]:
     """Return cameras that nobody took amid neighbors of more than `FEW_CAMERAS` training cameras; of fewer, none.
 
-    They stand amid every training camera and two of its `NEIGHBORS` nearest: a third of the way from the middle of the
-    first two to the last. Of more than `MOST_UNSEEN` so many are returned, spread evenly.
+    They stand amid every training camera and two of its nearest ``neighbors``: a third of the way from the middle of
+    the first two to the last. Of more than `MOST_UNSEEN` so many are returned, spread evenly.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
@@ -398,7 +398,7 @@ def amid_views(scene: Scene) -> list[Viewpoint]:
     if len(cameras) <= FEW_CAMERAS:
         return []
     positions = torch.stack([camera.position for camera in cameras])
-    near = nearest_neighbors(positions, min(NEIGHBORS, len(cameras) - 1))[1].tolist()
+    near = nearest_neighbors(positions, min(neighbors, len(cameras) - 1))[1].tolist()
     triples = sorted({tuple(sorted((i, *pair))) for i, of in enumerate(near) for pair in combinations(of, 2)})
     chosen = torch.linspace(0, len(triples) - 1, min(len(triples), MOST_UNSEEN)).round().int().tolist()
     found = []
