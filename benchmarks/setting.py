@@ -17,12 +17,11 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from statistics import fmean, median
+from statistics import fmean
 from typing import Annotated, Any, Literal
 
 import torch
 import tyro
-from scipy.stats import binomtest
 
 from benchmarks.guard import OTHER_EXPOSURE, quality
 from benchmarks.paper.rows import Rows, value
@@ -47,13 +46,14 @@ __all__ = [
     "choosing",
     "controls",
     "differences",
-    "failures",
     "fifth",
     "fourth",
+    "from_dense",
     "judging",
     "main",
     "measured",
     "recommended",
+    "references_of",
     "rows_of",
     "second",
     "shared_views",
@@ -94,8 +94,6 @@ SEEDS = 5
 """So many, from 0 on, judge the chosen one."""
 FEWEST = 3
 """From so many seeds on, a setting stands in the table of failures."""
-FAILURE = 1.0
-"""A training so many dB below the median of its scene and setting has failed."""
 HELD_OUT = tuple(scene for scene in SCENES if scene not in ("lego", "dtu-scan24"))
 """The scenes whose held-out views choose."""
 FEW_AND_RANDOM = "few measured points, random added"
@@ -106,8 +104,6 @@ STARTS = {
     "measured.ply": "measured", "dense_and_measured.ply": "dense and measured",
 }  # fmt: skip
 """Values of ``--points`` whose rows stand apart, and what they are called: files of `benchmarks.start_scenes`."""
-FAILING = ("herz-jesu", "fountain", "dtu-scan65", "sceaux")
-"""The scenes of the study of failures."""
 REFERENCES = Path(__file__).with_name("data") / "paper"
 """Folder with the rows of the paper's grid."""
 BINOCULAR = "Binocular3DGS, dropout"
@@ -170,7 +166,6 @@ def tables(rows: Sequence[Row]) -> list[str]:
         third(rows),
         fourth(rows),
         fifth(rows),
-        failures(rows),
     ]
 
 
@@ -312,7 +307,7 @@ def _gains(
     for name in names:
         line, gains = {"candidate": name}, list[tuple[float, float]]()
         for scene in HELD_OUT:
-            recipe, own = (rows_of(rows, _from_dense(scene), x) for x in (LATER, f"{LATER} + {name}"))
+            recipe, own = (rows_of(rows, from_dense(scene), x) for x in (LATER, f"{LATER} + {name}"))
             before = [recipe[seed] for seed in seeds if figure in recipe.get(seed, ())]
             if before and figure in (after := own.get(0, {})):
                 shown = after[figure] - fmean(row[figure] for row in before)
@@ -331,7 +326,7 @@ def judging(rows: Sequence[Row], references: Path = REFERENCES, *, chosen: str =
     lines, perceptual, counts, spreads = [], list[float](), list[float](), list[float]()
     gains = differences(rows, references, chosen=chosen)
     for scene, pairs in gains.items():
-        known = _references(rows, references, scene) | {name: rows_of(rows, scene, name) for name in (CHOSEN, chosen)}
+        known = references_of(rows, references, scene) | {name: rows_of(rows, scene, name) for name in (CHOSEN, chosen)}
         compared = {
             name: {seed: row for seed, row in known[name].items() if seed < SEEDS}
             for name in dict.fromkeys(("plain", "dropout", CHOSEN, chosen))
@@ -396,7 +391,7 @@ def differences(
     """Return by how much a setting is ahead of the plain training of the same seed, test PSNR, by scene."""
     found: dict[str, list[float]] = {}
     for scene in names:
-        own, plain = rows_of(rows, scene, chosen), _references(rows, references, scene)["plain"]
+        own, plain = rows_of(rows, scene, chosen), references_of(rows, references, scene)["plain"]
         if shared := sorted(own.keys() & plain.keys() & set(range(SEEDS))):
             found[scene] = [value(own[seed], "test psnr") - value(plain[seed], "test psnr") for seed in shared]
     return found
@@ -406,7 +401,7 @@ def binocular(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     """Return the table of both chosen ones against Binocular3DGS with dropout, over the seeds that all have."""
     lines, ahead = [], dict[str, list[float]]()
     for scene in SCENES:
-        every = {BINOCULAR: _references(rows, references, scene)[BINOCULAR]}
+        every = {BINOCULAR: references_of(rows, references, scene)[BINOCULAR]}
         every |= {name: rows_of(rows, scene, name) for name in (CHOSEN, LATER)}
         if not (shared := sorted(set.intersection(*(set(of) for of in every.values())))):
             continue
@@ -446,7 +441,7 @@ def controls(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     """Return the table of the later beginning without dropout, and without decay and guard: test PSNR, seed 0."""
     lines = []
     for scene in SCENES:
-        kept = _references(rows, references, scene)
+        kept = references_of(rows, references, scene)
         every = {name: kept[name] for name in ("plain", "dropout")} | {CHOSEN: rows_of(rows, scene, CHOSEN)}
         later = {name: rows_of(rows, scene, f"{name}, {LATER}") for name in ("plain", "dropout")}
         later[CHOSEN] = rows_of(rows, scene, LATER)
@@ -461,45 +456,13 @@ def controls(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     return markdown_table(lines, [*lines[0]]) if lines else "No control was trained."
 
 
-def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
-    """Return the table of the seeds: median, spread and the worst by scene and setting, and how often one fails."""
-    lines, counts, below = [], dict[str, list[bool]](), dict[str, list[bool]]()
-    for scene in FAILING:
-        every = {DENSE: rows_of(rows, _from_dense(scene), LATER)}
-        every |= {name: rows_of(rows, scene, name) for name in (LATER, CHOSEN)}
-        every |= _references(rows, references, scene)
-        figures = {
-            name: {seed: value(row, "test psnr") for seed, row in of.items()}
-            for name, of in every.items()
-            if len(of) >= FEWEST
-        }
-        for name, of in figures.items():
-            middle, worst = median(of.values()), min(of.values())
-            failed = [x < middle - FAILURE for x in of.values()]
-            counts.setdefault(name, []).extend(failed)
-            lines.append({
-                "scene": scene, "setting": name, "seeds": str(len(of)), "median": f"{middle:.2f}",
-                "standard deviation": f"{mean_std(of.values())[1]:.2f}", "worst": f"{worst:.2f}",
-                "to the median": f"{worst - middle:+.2f}", "failures": str(sum(failed)),
-            })  # fmt: skip
-        plain = figures.get("plain", {})
-        for name in (LATER, CHOSEN):
-            own = figures.get(name, {})
-            below.setdefault(name, []).extend(own[seed] < plain[seed] for seed in own.keys() & plain.keys())
-    if not lines:
-        return f"No setting has {FEWEST} seeds."
-    shares = [f"{name}: {_share(of)} fail" for name, of in counts.items()]
-    shares += [f"{name} below plain, same seed: {_share(of)}" for name, of in below.items() if of]
-    return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {line}" for line in shares)])
-
-
 def _scene(options: SceneOptions) -> str:
     """Return the name of a scene, with its points where these are others than the scene's own."""
     start = STARTS.get(options.points)
     return Path(options.path).name + (f", {start}" if start else "")
 
 
-def _from_dense(scene: str) -> str:
+def from_dense(scene: str) -> str:
     """Return the name of a scene that begins with a dense start, and with few measured points where there are any."""
     return f"{scene}, {'dense and few' if scene in SIFT else 'dense'}"
 
@@ -508,20 +471,12 @@ def _is_second(candidate: str) -> bool:
     return set(candidate.split(" + ")) <= _SECOND.keys()
 
 
-def _share(of: Sequence[bool]) -> str:
-    """Return a share with its interval of 95 % (Clopper and Pearson)."""
-    if not of:
-        return "0 of 0"
-    low, high = binomtest(sum(of), len(of)).proportion_ci(method="exact")
-    return f"{sum(of)} of {len(of)} ({100 * low:.0f} to {100 * high:.0f} %)"
-
-
 def rows_of(rows: Sequence[Row], scene: str, name: str) -> dict[int, Row]:
     """Return the rows of a scene and a candidate by seed."""
     return {row["seed"]: row for row in rows if (row["scene"], row["candidate"]) == (scene, name)}
 
 
-def _references(rows: Sequence[Row], references: Path, scene: str) -> dict[str, dict[int, Row]]:
+def references_of(rows: Sequence[Row], references: Path, scene: str) -> dict[str, dict[int, Row]]:
     """Return what the chosen one is compared with, by name and seed: the grid's rows, and own ones of further seeds."""
     kept = Rows(references / f"{scene}.json")
     return {

@@ -1,0 +1,69 @@
+"""How often a setting fails, from the rows of `benchmarks.setting`; see benchmarks/setting.md.
+
+python -m benchmarks.failures benchmarks/data/setting.json
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+
+from scipy.stats import binomtest
+
+from benchmarks.paper.rows import value
+from benchmarks.setting import CHOSEN, DENSE, FEWEST, LATER, REFERENCES, Row, from_dense, references_of, rows_of
+from reference_trainer.evaluation.tables import markdown_table, mean_std
+
+__all__ = ["FAILING", "failures"]
+
+FAILURE = 1.0
+"""A training so many dB below the median of its scene and setting has failed."""
+FAILING = ("herz-jesu", "fountain", "dtu-scan65", "sceaux")
+"""The scenes of the study."""
+
+
+def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
+    """Return the table of the seeds: median, spread and the worst by scene and setting, and how often one fails."""
+    lines, counts, below = [], dict[str, list[bool]](), dict[str, list[bool]]()
+    for scene in FAILING:
+        every = {DENSE: rows_of(rows, from_dense(scene), LATER)}
+        every |= {name: rows_of(rows, scene, name) for name in (LATER, CHOSEN)}
+        every |= references_of(rows, references, scene)
+        figures = {
+            name: {seed: value(row, "test psnr") for seed, row in of.items()}
+            for name, of in every.items()
+            if len(of) >= FEWEST
+        }
+        for name, of in figures.items():
+            middle, worst = median(of.values()), min(of.values())
+            failed = [x < middle - FAILURE for x in of.values()]
+            counts.setdefault(name, []).extend(failed)
+            lines.append({
+                "scene": scene, "setting": name, "seeds": str(len(of)), "median": f"{middle:.2f}",
+                "standard deviation": f"{mean_std(of.values())[1]:.2f}", "worst": f"{worst:.2f}",
+                "to the median": f"{worst - middle:+.2f}", "failures": str(sum(failed)),
+            })  # fmt: skip
+        plain = figures.get("plain", {})
+        for name in (LATER, CHOSEN):
+            own = figures.get(name, {})
+            below.setdefault(name, []).extend(own[seed] < plain[seed] for seed in own.keys() & plain.keys())
+    if not lines:
+        return f"No setting has {FEWEST} seeds."
+    shares = [f"{name}: {_share(of)} fail" for name, of in counts.items()]
+    shares += [f"{name} below plain, same seed: {_share(of)}" for name, of in below.items() if of]
+    return "\n".join([markdown_table(lines, list(lines[0])), "", *(f"- {line}" for line in shares)])
+
+
+def _share(of: Sequence[bool]) -> str:
+    """Return a share with its interval of 95 % (Clopper and Pearson)."""
+    if not of:
+        return "0 of 0"
+    low, high = binomtest(sum(of), len(of)).proportion_ci(method="exact")
+    return f"{sum(of)} of {len(of)} ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+if __name__ == "__main__":
+    print(failures(json.loads(Path(sys.argv[1]).read_text("utf-8"))))
