@@ -57,6 +57,7 @@ __all__ = [
     "rows_of",
     "second",
     "shared_views",
+    "sixth",
     "starts",
     "tables",
 ]
@@ -81,8 +82,15 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "no smoothness": ("loss", "smooth=0.0"),
     "depth of the points": ("loss", "pearson("),
     "flat": ("loss", "flat("),
+    "means x4": ("means_rate", 6.4e-4),
+    "means x1/4": ("means_rate", 4e-5),
+    "means by pixels": ("means_rate", (2.45e-3, 4.7e-4, 5.2e-4, 2.5e-4, 5e-4, 1.67e-4)),
+    "opacities x1/2": ("opacity_rate", 0.025),
+    "scales x1/2": ("scales_rate", 2.5e-3),
+    "colors x1/2": ("color_rate", 1.25e-3),
 }
-"""What a candidate of the later choices changes in the chosen setting: a field and its value, of a loss the term."""
+"""What a candidate of the later choices changes in the chosen setting: a field and its value or values, of a loss the
+term."""
 _FIGURES = "psnr", "ssim", "lpips", "ca_exact_half"
 CHOSEN = "drawn"
 """What the first choice chose, and the second started from: ``--recipe sparse --densify-from 150``."""
@@ -166,6 +174,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
         third(rows),
         fourth(rows),
         fifth(rows),
+        sixth(rows),
     ]
 
 
@@ -182,7 +191,11 @@ def candidate(config: TrainConfig) -> str:
     if config.opacity_decay < 1 and config.guard:
         config = dataclasses.replace(config, densify_from=begins)
         values = {name: (getattr(config, field), value) for name, (field, value) in _SECOND.items()}
-        changes = [name for name, (x, value) in values.items() if (value in x if isinstance(x, str) else x == value)]
+        changes = [
+            name
+            for name, (x, value) in values.items()
+            if (value in x if isinstance(x, str) else x in value if isinstance(value, tuple) else x == value)
+        ]
         return " + ".join(changes) or CHOSEN
     if "warp" in config.loss:
         return "Binocular3DGS" + (", dropout" if config.dropout else "")
@@ -286,6 +299,12 @@ def fifth(rows: Sequence[Row]) -> str:
     """Return the table of the fifth choice: gains of seed 0 at shared pixels over the recipe's seeds 3 to 5."""
     warps = ("warp + hidden left out", "warp + hidden left out + every second step")
     return _gains(rows, warps, seeds=range(3, 6), figure="shared")
+
+
+def sixth(rows: Sequence[Row]) -> str:
+    """Return the table of the sixth choice: gains of seed 0 over the mean of the recipe's six seeds."""
+    rates = ("means x4", "means x1/4", "means by pixels", "opacities x1/2", "scales x1/2", "colors x1/2")
+    return _gains(rows, rates, seeds=range(6))
 
 
 def _gains(

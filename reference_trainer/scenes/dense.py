@@ -23,7 +23,7 @@ from reference_trainer.scenes.images import resize_image
 from reference_trainer.scenes.scene import PointCloud, View
 
 __all__ = [
-    "ENOUGH", "MOST", "MOST_IF_RANDOM", "SOURCE", "dense_points", "dense_start", "matched_size", "source_views",
+    "ENOUGH", "SOURCE", "THIN", "dense_points", "dense_start", "made_unasked", "matched_size", "source_views",
 ]  # fmt: skip
 
 SOURCE = "dense stereo"
@@ -31,9 +31,9 @@ SOURCE = "dense stereo"
 
 COUNT = 15_000
 LEAST = 1_000
+THIN = 1_000  # measured points; to fewer, random ones are added where a dense start cannot be
 ENOUGH = 10_000  # measured points, to which none are added unasked
-MOST = 10  # photographs to measure on unasked: each takes five seconds of a core
-MOST_IF_RANDOM = 16  # the same where so few points are measured that random ones would be added
+MOST, MOST_IF_THIN = 10, 16  # photographs to measure on unasked: each takes five seconds of a core
 PIXELS = 200_000  # larger photographs are made smaller: more pixels take longer and add no points
 ENLARGED = 1.4  # and smaller ones larger: the windows, of a fixed number of pixels, then cover finer detail
 SPACING, PLANES = 0.7, 192  # pixels of motion from plane to plane, and their largest number
@@ -64,6 +64,16 @@ class _Depths(NamedTuple):
     planes: NDArray[np.float32]
     scores: NDArray[np.float32]
     sources: list[int]
+
+
+def made_unasked(points: int, photographs: int) -> bool:
+    """Return whether a training on so many photographs, with so many measured points, begins with a dense start.
+
+    Example:
+        >>> made_unasked(500, photographs=16), made_unasked(5_000, photographs=16), made_unasked(5_000, photographs=3)
+        (True, False, True)
+    """
+    return points < ENOUGH and photographs <= (MOST_IF_THIN if points < THIN else MOST)
 
 
 def dense_points(views: Sequence[View], guide: PointCloud | None = None, *, count: int = COUNT) -> PointCloud:

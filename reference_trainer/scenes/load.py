@@ -14,14 +14,14 @@ from torch import Tensor
 
 from reference_trainer.json_files import read_json
 from reference_trainer.scenes.colmap import COLMAP
-from reference_trainer.scenes.dense import ENOUGH, MOST, MOST_IF_RANDOM, dense_start
+from reference_trainer.scenes.dense import THIN, dense_start, made_unasked
 from reference_trainer.scenes.depth import point_prior, true_priors, with_prior
 from reference_trainer.scenes.formats import Capture, find_reader, only_default, register_format
 from reference_trainer.scenes.frames import Frame, corner_displacement, load_view
 from reference_trainer.scenes.images import LARGE_PICTURE, image_size, unreadable_photographs
 from reference_trainer.scenes.numpy_formats import ARRAYS, IDR, LLFF
 from reference_trainer.scenes.options import BACKGROUNDS, SceneOptions
-from reference_trainer.scenes.points import THIN, check_no_leak, choose_points, filled, model_start
+from reference_trainer.scenes.points import check_no_leak, choose_points, filled, model_start
 from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.scenes.transforms import BLENDER, TRANSFORMS
@@ -119,7 +119,7 @@ def _enough_points(
 ) -> tuple[PointCloud, str]:
     """Add to measured points, if they are few, those of a dense start, or random ones where that cannot be."""
     number, fault = len(cloud.positions), ""
-    if number < ENOUGH and len(views) <= (MOST_IF_RANDOM if number < THIN else MOST):
+    if made_unasked(number, len(views)):
         try:
             cloud, found = dense_start(views, cloud)
             return cloud, found if number else "; ".join(filter(None, (found, about)))

@@ -25,8 +25,6 @@ __all__ = [
 ]  # fmt: skip
 
 RANDOM_POINTS = 10_000  # as DNGaussian for the Blender scenes
-THIN = 1_000
-"""To a measured cloud of fewer points random ones are added where a dense start cannot be, unless it was asked for."""
 INSTANTSPLAT = "points3D.ply"
 OPAQUE = 13.0  # replaces an infinite logit, which cannot be trained
 

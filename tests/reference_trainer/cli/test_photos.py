@@ -25,8 +25,8 @@ from reference_trainer.scenes.images import read_image
 SCENE = synthetic_scene(width=40, height=30, points=150)
 
 
-def write_cameras(scene, folder):
-    """COLMAP's text files of the built-in scene, as COLMAP documents them."""
+def write_cameras(scene, folder, points=150):
+    """COLMAP's text files of the built-in scene, as COLMAP documents them; its points are repeated."""
     folder.mkdir(parents=True)
     camera = SCENE.train[0].camera
     lens = f"{camera.fx} {camera.fy} {camera.cx} {camera.cy}"
@@ -37,8 +37,9 @@ def write_cameras(scene, folder):
         x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
         lines += [" ".join(map(str, [number, w, x, y, z, *pose[:3, 3], 1, f"{view.name}.png"])), ""]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
-    points = [" ".join(map(str, [i, *p, 9, 9, 9, 0.5, 1, 0])) for i, p in enumerate(SCENE.points.positions.tolist(), 1)]
-    (folder / "points3D.txt").write_text("\n".join(points) + "\n")
+    places = SCENE.points.positions.tolist()
+    lines = [" ".join(map(str, [i + 1, *places[i % len(places)], 9, 9, 9, 0.5, 1, 0])) for i in range(points)]
+    (folder / "points3D.txt").write_text("\n".join(lines) + "\n")
 
 
 @pytest.fixture
@@ -162,11 +163,14 @@ def test_a_run_that_is_moved_takes_its_photographs_along(garden, tmp_path, capsy
 
 
 @pytest.mark.slow
-def test_photographs_with_cameras_stay_where_they_are(garden, tmp_path, monkeypatch):
+@pytest.mark.parametrize("points", [150, 10_000])
+def test_photographs_with_cameras_stay_where_they_are(garden, tmp_path, monkeypatch, capsys, points):
     monkeypatch.setattr(poses, "find_poses", None)  # nobody calls it
-    write_cameras(SCENE, garden / "sparse" / "0")
+    write_cameras(SCENE, garden / "sparse" / "0", points)
     before = seen(garden)
     main(["run", "garden", "--out", "out", "--quick", "--no-open"])
+    forecast = re.search(r"will take about .* now: (.*)\.\n", capsys.readouterr().out)[1]
+    assert ("points" in forecast) == (points == 150), forecast  # of enough measured points no more are made
     assert seen(garden) == before
     assert not (tmp_path / "out" / "scene").exists()
     with Image.open(tmp_path / "out/views/train/train_0.png") as view:  # 600 pixels of 40 x 30
