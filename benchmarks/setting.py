@@ -56,6 +56,7 @@ __all__ = [
     "references_of",
     "rows_of",
     "second",
+    "seventh",
     "shared_views",
     "sixth",
     "starts",
@@ -110,8 +111,12 @@ STARTS = {
     "dense_and_few.ply": "dense and few", "dense_and_random.ply": "dense, few and random", "sift.ply": "SIFT",
     "dense_and_sift.ply": "dense and SIFT", "dense_and_other.ply": "dense and other",
     "measured.ply": "measured", "dense_and_measured.ply": "dense and measured",
+    "dense_5000.ply": "5,000 dense and few", "dense_8000.ply": "8,000 dense and few",
+    "dense_30000.ply": "30,000 dense and few", "dense_filled.ply": "filled",
 }  # fmt: skip
 """Values of ``--points`` whose rows stand apart, and what they are called: files of `benchmarks.start_scenes`."""
+COUNTS = ("5,000 dense and few", "8,000 dense and few", "30,000 dense and few", "filled")
+"""The starts of the seventh choice."""
 REFERENCES = Path(__file__).with_name("data") / "paper"
 """Folder with the rows of the paper's grid."""
 BINOCULAR = "Binocular3DGS, dropout"
@@ -175,6 +180,8 @@ def tables(rows: Sequence[Row]) -> list[str]:
         fourth(rows),
         fifth(rows),
         sixth(rows),
+        sixth(rows, (0, 1)),
+        seventh(rows),
     ]
 
 
@@ -301,10 +308,15 @@ def fifth(rows: Sequence[Row]) -> str:
     return _gains(rows, warps, seeds=range(3, 6), figure="shared")
 
 
-def sixth(rows: Sequence[Row]) -> str:
-    """Return the table of the sixth choice: gains of seed 0 over the mean of the recipe's six seeds."""
+def sixth(rows: Sequence[Row], tried: Sequence[int] = (0,)) -> str:
+    """Return the table of the sixth choice: gains of these seeds over the mean of the recipe's six seeds."""
     rates = ("means x4", "means x1/4", "means by pixels", "opacities x1/2", "scales x1/2", "colors x1/2")
-    return _gains(rows, rates, seeds=range(6))
+    return _gains(rows, rates, seeds=range(6), tried=tried)
+
+
+def seventh(rows: Sequence[Row]) -> str:
+    """Return the table of the seventh choice, of other starts: gains of seed 0 over the usual one, mean of six."""
+    return _gains(rows, COUNTS, seeds=range(6), starts=True)
 
 
 def _gains(
@@ -312,27 +324,33 @@ def _gains(
     names: Sequence[str],
     *,
     seeds: Sequence[int],
+    tried: Sequence[int] = (0,),
     figure: Literal["held-out", "shared"] = "held-out",
+    starts: bool = False,
 ) -> str:
     """Return a table of what candidates gain with the dense start: at held-out / test views, and Gaussians.
 
     Args:
         rows: all of them.
-        names: of what the candidates add to the recipe; their seed is 0.
+        names: of what the candidates add to the recipe, or of the points from which it begins.
         seeds: of the recipe's trainings over whose mean they gain.
+        tried: the candidates' seeds.
         figure: whether all pixels of the held-out views count, or the shared ones.
+        starts: whether the names are of points.
     """
     lines = []
     for name in names:
         line, gains = {"candidate": name}, list[tuple[float, float]]()
         for scene in HELD_OUT:
-            recipe, own = (rows_of(rows, from_dense(scene), x) for x in (LATER, f"{LATER} + {name}"))
-            before = [recipe[seed] for seed in seeds if figure in recipe.get(seed, ())]
-            if before and figure in (after := own.get(0, {})):
-                shown = after[figure] - fmean(row[figure] for row in before)
-                gains.append((shown, value(after, "test psnr") - fmean(value(row, "test psnr") for row in before)))
-                more = after["gaussians"] / fmean(row["gaussians"] for row in before)
-                line[scene] = "{:+.2f} / {:+.2f}, {:.2f}".format(*gains[-1], more)
+            own = (f"{scene}, {name}", LATER) if starts else (from_dense(scene), f"{LATER} + {name}")
+            before, after = (
+                [(of[s][figure], value(of[s], "test psnr"), of[s]["gaussians"]) for s in who if figure in of.get(s, ())]
+                for of, who in ((rows_of(rows, from_dense(scene), LATER), seeds), (rows_of(rows, *own), tried))
+            )
+            if before and len(after) == len(tried):
+                usual, found = (tuple(map(fmean, zip(*of, strict=True))) for of in (before, after))
+                gains.append((found[0] - usual[0], found[1] - usual[1]))
+                line[scene] = "{:+.2f} / {:+.2f}, {:.2f}".format(*gains[-1], found[2] / usual[2])
         if gains:
             means = map(fmean, zip(*gains, strict=True))
             lines.append(line | {"mean": "{:+.2f} / {:+.2f}".format(*means), "scenes": str(len(gains))})

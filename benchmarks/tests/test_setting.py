@@ -121,6 +121,32 @@ def test_the_fifth_choice_gains_at_shared_pixels_over_the_later_seeds():
     assert [x.strip() for x in line.split("|")[2:-1]] == ["+2.00 / +1.00, 1.00", "+2.00 / +1.00", "1"]
 
 
+def test_the_later_choices_gain_over_all_seeds_of_the_recipe():
+    start = "fern, dense and few"
+    rows = [row(start, "from 1,000", seed, 25.0 + seed, 20.0 + seed) for seed in range(6)]
+    rows += [row(start, "from 1,000 + means x4", seed, 28.0 + seed, 23.0 + seed) for seed in (0, 1)]
+    rows += [row("fern, filled", "from 1,000", 0, 27.0, 23.5)]
+    for table, gains in (
+        (setting.sixth(rows), "+0.50 / +0.50"),
+        (setting.sixth(rows, (0, 1)), "+1.00 / +1.00"),
+        (setting.sixth(rows, (0, 2)), None),
+        (setting.seventh(rows), "+1.00 / -0.50"),
+    ):
+        lines = [
+            [x.strip() for x in line.split("|")[2:-1]]
+            for line in table.splitlines()
+            if "means" in line or "filled" in line
+        ]
+        assert lines == ([] if gains is None else [[f"{gains}, 1.00", gains, "1"]])
+
+
+def test_a_rate_of_the_means_by_pixels_is_another_on_every_scene():
+    names = [
+        setting.candidate(with_recipe("sparse", iterations=3_000, means_rate=rate)) for rate in (6.4e-4, 2.5e-4, 5e-4)
+    ]
+    assert names == [f"from 1,000 + means {how}" for how in ("x4", "by pixels", "by pixels")]
+
+
 def test_a_warp_is_named_by_what_it_leaves_out():
     hidden = "shift=0.15, relative=True, hidden=0.02"
     for loss, name in (
