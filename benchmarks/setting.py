@@ -15,7 +15,7 @@ import dataclasses
 import json
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Literal
@@ -42,6 +42,7 @@ from reference_trainer.training.config import TrainConfig
 
 __all__ = [
     "binocular",
+    "by_default",
     "candidate",
     "choosing",
     "controls",
@@ -184,6 +185,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
         sixth(rows, (0, 1)),
         sixth_judged(rows),
         seventh(rows),
+        by_default(rows),
     ]
 
 
@@ -319,24 +321,45 @@ def sixth(rows: Sequence[Row], tried: Sequence[int] = (0,)) -> str:
 
 
 def sixth_judged(rows: Sequence[Row]) -> str:
-    """Return the table of a quarter of the means' rate against the recipe: test PSNR of the seeds that both have."""
-    lines, every = [], list[float]()
+    """Return the table of a quarter of the means' rate against the recipe."""
+    return _from_same_start(rows, {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"})
+
+
+def by_default(rows: Sequence[Row]) -> str:
+    """Return the table of the recipe against plain 3DGS, both from the start that a user has."""
+    return _from_same_start(rows, {"plain": "plain", LATER: "recipe"})
+
+
+def _from_same_start(rows: Sequence[Row], titles: Mapping[str, str]) -> str:
+    """Return a table of two settings with the dense start: test PSNR of the seeds that both have, and the gains.
+
+    Args:
+        rows: all of them.
+        titles: of both, by the names of their rows.
+    """
+    lines, every, spreads = [], list[float](), list[float]()
     for scene in SCENES:
-        start = scene if scene == "synthetic" else from_dense(scene)
-        usual, slower = (rows_of(rows, start, name) for name in (LATER, f"{LATER} + means x1/4"))
-        if shared := sorted(usual.keys() & slower.keys()):
-            figures = [[value(of[seed], "test psnr") for seed in shared] for of in (usual, slower)]
-            gains = [after - before for before, after in zip(*figures, strict=True)]
-            every.append(fmean(gains))
-            lines.append({
-                "scene": scene, "seeds": str(len(shared)), "recipe": format_mean_std(figures[0], decimals=2),
-                "means x1/4": format_mean_std(figures[1], decimals=2),
-                "gain, by seed": ", ".join(f"{x:+.2f}" for x in gains),
-            })  # fmt: skip
+        start = scene if scene == "synthetic" else from_dense(scene)  # which has points of its own
+        before, after = (rows_of(rows, start, name) for name in titles)
+        if start == scene and "plain" in titles:
+            before = references_of(rows, REFERENCES, scene)["plain"]
+        if shared := sorted(before.keys() & after.keys()):
+            figures = [[value(of[seed], "test psnr") for seed in shared] for of in (before, after)]
+            gains = [y - x for x, y in zip(*figures, strict=True)]
+            every += gains
+            spreads += [mean_std(figures[1])[1]] if len(shared) > 1 else []
+            line = {"scene": scene, "seeds": str(len(shared))}
+            line |= {title: format_mean_std(of, decimals=2) for title, of in zip(titles.values(), figures, strict=True)}
+            lines.append(line | {"gain, by seed": ", ".join(f"{x:+.2f}" for x in gains)})
     if not lines:
-        return "Nothing was judged."
-    mean = f"- mean gain over {len(every)} scenes: {fmean(every):+.2f} dB"
-    return "\n".join([markdown_table(lines, [*lines[0]]), "", mean])
+        return "Nothing was trained with both."
+    total = [
+        f"- mean gain over {len(every)} pairs of {len(lines)} scenes: {fmean(every):+.2f} dB",
+        f"- worst pair: {min(every):+.2f} dB",
+    ]
+    if spreads:
+        total.append(f"- standard deviation of seeds, mean over {len(spreads)} scenes: {fmean(spreads):.2f} dB")
+    return "\n".join([markdown_table(lines, [*lines[0]]), "", *total])
 
 
 def seventh(rows: Sequence[Row]) -> str:

@@ -1,6 +1,7 @@
 """Scenes whose trainings start from other points, or with cameras of the training photographs alone.
 
     python -m benchmarks.start_scenes points ../shared/data OUT SCENE...     # OUT/SCENE with a .ply for each start
+    python -m benchmarks.start_scenes counts ../shared/data OUT SCENE...     # the same of dense starts of other numbers
     python -m benchmarks.start_scenes cameras ../shared/data OUT SCENE...    # OUT/SCENE-own
     python -m benchmarks.start_scenes many ../shared/data OUT SCENE...       # OUT/SCENE-many, 14 or 16 photographs
 
@@ -25,14 +26,14 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from benchmarks.paper.scenes import SCENES
-from reference_trainer.scenes.dense import dense_start
+from reference_trainer.scenes.dense import dense_points, dense_start
 from reference_trainer.scenes.load import evenly_spaced, load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.points import colmap_points, filled, random_points_in_frusta
 from reference_trainer.scenes.poses import LARGEST_SIDE, enlarge, find_poses
 from reference_trainer.scenes.scene import PointCloud
 
-__all__ = ["MANY", "SIFT", "with_many_photographs", "with_own_cameras", "with_points"]
+__all__ = ["COUNTS", "MANY", "SIFT", "with_counts", "with_many_photographs", "with_own_cameras", "with_points"]
 
 SIFT = {
     "fern": "sparse_3views/0", "herz-jesu": "sparse_3near/0", "fountain": "sparse_3near/0",
@@ -45,6 +46,8 @@ MANY = {"fern": 14, "cape": 16, "dtu-scan65": 16, "dtu-scan24": 16}
 """Scenes of more than ten photographs, and how many of them train."""
 FEW = 450
 """So many it finds where it must find the cameras as well."""
+COUNTS = (5_000, 8_000, 30_000)
+"""Points of a dense start, which usually has 15,000."""
 LEAST = 20
 """So many points place a photograph."""
 
@@ -55,10 +58,7 @@ def with_points(data: Path, out: Path, name: str) -> None:
     sift = colmap_points(data / name / SIFT[name]) if name in SIFT else None
     train = load_scene(replace(SCENES[name].options, path=str(data / name)), trains=False).train
     generator = torch.Generator().manual_seed(0)
-    few = PointCloud(torch.empty(0, 3), torch.empty(0, 3), "none", frozenset())
-    if sift is not None:
-        some = torch.randperm(len(sift.positions), generator=generator)[:FEW]
-        few = replace(sift, positions=sift.positions[some], colors=sift.colors[some])
+    few = _few(sift, generator)
     both, _ = dense_start(train, few)
     number = len(both.positions) - len(few.positions)
     clouds = {"dense": replace(both, positions=both.positions[:number], colors=both.colors[:number])}
@@ -78,6 +78,26 @@ def with_points(data: Path, out: Path, name: str) -> None:
     for start, cloud in clouds.items():
         write_points(folder / f"{start}.ply", cloud.positions, cloud.colors)
         print(f"{name}: {start}, {len(cloud.positions):,} points")
+
+
+def with_counts(data: Path, out: Path, name: str) -> None:
+    """Write the folder of a scene with links to its files, and dense starts of `COUNTS` points beside the few."""
+    folder = _linked(data / name, out / name)
+    train = load_scene(replace(SCENES[name].options, path=str(data / name)), trains=False).train
+    few = _few(colmap_points(data / name / SIFT[name]) if name in SIFT else None, torch.Generator().manual_seed(0))
+    for count in COUNTS:
+        cloud = dense_points(train, few, count=count)
+        positions, colors = torch.cat([cloud.positions, few.positions]), torch.cat([cloud.colors, few.colors])
+        write_points(folder / f"dense_{count}.ply", positions, colors)
+        print(f"{name}: {len(positions):,} points")
+
+
+def _few(sift: PointCloud | None, generator: torch.Generator) -> PointCloud:
+    """Return so many of the points that COLMAP found as it finds where it must find the cameras as well."""
+    if sift is None:
+        return PointCloud(torch.empty(0, 3), torch.empty(0, 3), "none", frozenset())
+    some = torch.randperm(len(sift.positions), generator=generator)[:FEW]
+    return replace(sift, positions=sift.positions[some], colors=sift.colors[some])
 
 
 def with_many_photographs(data: Path, out: Path, name: str) -> None:
@@ -213,6 +233,7 @@ def _placed(model: Any, images: Path) -> list[tuple[str, int, Any]]:
 
 
 if __name__ == "__main__":
-    make = {"points": with_points, "cameras": with_own_cameras, "many": with_many_photographs}[sys.argv[1]]
+    makers = {"points": with_points, "counts": with_counts, "cameras": with_own_cameras, "many": with_many_photographs}
+    make = makers[sys.argv[1]]
     for scene in sys.argv[4:]:
         make(Path(sys.argv[2]), Path(sys.argv[3]), scene)

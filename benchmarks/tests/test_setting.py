@@ -140,6 +140,18 @@ def test_the_later_choices_gain_over_all_seeds_of_the_recipe():
         assert lines == ([] if gains is None else [[f"{gains}, 1.00", gains, "1"]])
 
 
+def test_settings_from_the_same_start_are_met_by_seeds_that_both_have():
+    start = "fern, dense and few"
+    rows = [row(start, "plain", seed, 20.0 + seed) for seed in (3, 4)]
+    rows += [row(start, "from 1,000", seed, psnr) for seed, psnr in ((3, 25.0), (4, 23.0), (5, 99.0))]
+    rows += [row("fern", "plain", 5, 20.0)]  # of another start
+    text = setting.by_default(rows)
+    assert "| fern | 2 | 23.50 ± 0.71 | 24.00 ± 1.41 | +2.00, -1.00 |" in text
+    assert "mean gain over 2 pairs of 1 scenes: +0.50 dB" in text
+    assert "worst pair: -1.00 dB" in text
+    assert setting.sixth_judged(rows) == "Nothing was trained with both."
+
+
 def test_a_rate_of_the_means_by_pixels_is_another_on_every_scene():
     names = [
         setting.candidate(with_recipe("sparse", iterations=3_000, means_rate=rate)) for rate in (6.4e-4, 2.5e-4, 5e-4)
