@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -22,9 +22,6 @@ from reference_trainer.runs import folder as run
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import with_recipe
-
-if TYPE_CHECKING:
-    from reference_trainer.scenes.formats import Capture
 
 __all__ = ["Run"]
 
@@ -157,29 +154,25 @@ class Run:
     def _sizes(self, scene: Path) -> tuple[tuple[int, int], int]:
         """Return width and height of the largest photograph, and how many there are, placed or not."""
         from reference_trainer.scenes.images import image_size, list_images
+        from reference_trainer.scenes.load import find_reader
 
         if scene == self.photos:
-            paths = [frame.path for frame in self._capture(scene).frames]
+            paths = [frame.path for frame in find_reader(scene, "auto")(scene, SceneOptions(str(scene))).frames]
         else:
             paths = list_images(scene / "images")
         return max(map(image_size, paths), key=math.prod), len(paths)
 
-    @staticmethod
-    def _capture(scene: Path) -> Capture:
-        """Read the cameras of a scene that has them."""
-        from reference_trainer.scenes.load import find_reader
+    def _makes_dense_start(self, options: SceneOptions, count: int, *, placed: bool) -> bool:
+        """Return whether the training begins with a dense start; how many points `poses` leaves is not known before."""
+        from reference_trainer.scenes.dense import THIN, made_unasked
+        from reference_trainer.scenes.load import load_scene
 
-        return find_reader(scene, "auto")(scene, SceneOptions(str(scene)))
-
-    def _measured_points(self, scene: Path) -> int:
-        """Return how many points a scene with cameras has to start from."""
-        import torch
-
-        from reference_trainer.scenes.points import choose_points
-
-        capture = self._capture(scene)
-        cloud, _ = choose_points(scene, "auto", capture.frames, (), torch.Generator(), own=capture.points)
-        return len(cloud.positions)
+        if self.points != "auto":
+            return self.points == "dense"
+        if not placed or not made_unasked(0, count):
+            return made_unasked(THIN, count)
+        scene = load_scene(options, trains=False)
+        return made_unasked(len(scene.points.positions), len(scene.train))
 
     def _begin_again(self, *steps: Step) -> None:
         """Delete what these steps wrote, as far as `--from` says."""
@@ -211,7 +204,7 @@ class Run:
         """
         from reference_trainer.runs.warmup import step_seconds
         from reference_trainer.scenes.colmap import colmap_folders
-        from reference_trainer.scenes.dense import THIN, made_unasked, matched_size
+        from reference_trainer.scenes.dense import matched_size
         from reference_trainer.scenes.poses import FEW, feature_size
         from reference_trainer.training.checkpoint import load_checkpoint
 
@@ -224,14 +217,12 @@ class Run:
         size = round(width / factor), round(height / factor)
         pixels, step = math.prod(size), step_seconds(*size, self.device)
         core = step if self.device == "cpu" else _REFERENCE * pixels  # cameras and points are found by the processor
-        times, measured = {}, THIN  # what `poses` leaves is not known before
-        if scene == self.photos or colmap_folders(scene):
-            measured = self._measured_points(scene)
-        else:
+        times, placed = {}, scene == self.photos or bool(colmap_folders(scene))
+        if not placed:
             megapixels = math.prod(feature_size(width, height, few=count < FEW)) / 1e6
             work = count * megapixels * (10.0 if count < FEW else 2.0) + 0.025 * count * (count - 1) / 2
             times["poses"] = core / (_REFERENCE * pixels) * work
-        if not done and (self.points == "dense" or (self.points == "auto" and made_unasked(measured, count))):
+        if not done and self._makes_dense_start(options, count, placed=placed):
             times["points"] = core * _MATCHED * count * math.prod(matched_size(*size)) / pixels
         times["training"] = step * _TRAINING * (config.iterations - done)
         times["scores and page"] = step * _SHOWN * 3 * min(count, 8)
