@@ -15,7 +15,7 @@ import dataclasses
 import json
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Literal
@@ -42,13 +42,10 @@ from reference_trainer.training.config import TrainConfig
 
 __all__ = [
     "binocular",
-    "by_default",
     "candidate",
     "choosing",
     "controls",
     "differences",
-    "fifth",
-    "fourth",
     "from_dense",
     "judging",
     "main",
@@ -57,10 +54,7 @@ __all__ = [
     "references_of",
     "rows_of",
     "second",
-    "seventh",
     "shared_views",
-    "sixth",
-    "sixth_judged",
     "starts",
     "tables",
 ]
@@ -117,8 +111,6 @@ STARTS = {
     "dense_30000.ply": "30,000 dense and few", "dense_filled.ply": "filled",
 }  # fmt: skip
 """Values of ``--points`` whose rows stand apart, and what they are called: files of `benchmarks.start_scenes`."""
-COUNTS = ("5,000 dense and few", "8,000 dense and few", "30,000 dense and few", "filled")
-"""The starts of the seventh choice."""
 REFERENCES = Path(__file__).with_name("data") / "paper"
 """Folder with the rows of the paper's grid."""
 BINOCULAR = "Binocular3DGS, dropout"
@@ -178,14 +170,6 @@ def tables(rows: Sequence[Row]) -> list[str]:
         binocular(rows),
         controls(rows),
         starts(rows),
-        third(rows),
-        fourth(rows),
-        fifth(rows),
-        sixth(rows),
-        sixth(rows, (0, 1)),
-        sixth_judged(rows),
-        seventh(rows),
-        by_default(rows),
     ]
 
 
@@ -277,10 +261,8 @@ def choosing(rows: Sequence[Row]) -> str:
 def second(rows: Sequence[Row], seeds: Sequence[int] = (0,)) -> str:
     """Return the table of the second choice: gains at held-out views over the mean of the chosen one's seeds."""
     lines = []
-    others = dict.fromkeys(row["candidate"] for row in rows if _is_second(row["candidate"]))
-    for name in dict.fromkeys((*_SECOND, *others)):
-        if name.startswith(f"{LATER} + "):  # of the choices after it
-            continue
+    every = dict.fromkeys((*_SECOND, *(row["candidate"] for row in rows if _is_second(row["candidate"]))))
+    for name in (x for x in every if not x.startswith(f"{LATER} + ")):  # which is of the choices after it
         line, gains = {"candidate": name}, list[float]()
         for scene in HELD_OUT:
             own, found = (
@@ -293,115 +275,6 @@ def second(rows: Sequence[Row], seeds: Sequence[int] = (0,)) -> str:
                 line[scene] = f"{gains[-1]:+.2f}"
         if gains:
             lines.append(line | {"mean": f"{fmean(gains):+.2f}", "scenes": str(len(gains))})
-    columns = ["candidate", *(s for s in HELD_OUT if any(s in line for line in lines)), "mean", "scenes"]
-    return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
-
-
-def third(rows: Sequence[Row]) -> str:
-    """Return the table of the third choice: gains over the recipe with the same seed, 0."""
-    return _gains(rows, ("rate 0.3", "no reset", "threshold 3e-4"), seeds=(0,))
-
-
-def fourth(rows: Sequence[Row]) -> str:
-    """Return the table of the fourth choice: gains of seed 0 over the mean of the recipe's seeds."""
-    warps = ("warp", "warp + no smoothness", "warp + hidden left out", "warp + hidden left out + no smoothness")
-    return _gains(rows, (*warps, "depth of the points"), seeds=range(FEWEST))
-
-
-def fifth(rows: Sequence[Row]) -> str:
-    """Return the table of the fifth choice: gains of seed 0 at shared pixels over the recipe's seeds 3 to 5."""
-    warps = ("warp + hidden left out", "warp + hidden left out + every second step")
-    return _gains(rows, warps, seeds=range(3, 6), figure="shared")
-
-
-def sixth(rows: Sequence[Row], tried: Sequence[int] = (0,)) -> str:
-    """Return the table of the sixth choice: gains of these seeds over the mean of the recipe's six seeds."""
-    rates = ("means x4", "means x1/4", "means by pixels", "opacities x1/2", "scales x1/2", "colors x1/2")
-    return _gains(rows, rates, seeds=range(6), tried=tried)
-
-
-def sixth_judged(rows: Sequence[Row]) -> str:
-    """Return the table of a quarter of the means' rate against the recipe."""
-    return _from_same_start(rows, {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"})
-
-
-def by_default(rows: Sequence[Row]) -> str:
-    """Return the table of the recipe against plain 3DGS, both from the start that a user has."""
-    return _from_same_start(rows, {"plain": "plain", LATER: "recipe"})
-
-
-def _from_same_start(rows: Sequence[Row], titles: Mapping[str, str]) -> str:
-    """Return a table of two settings with the dense start: test PSNR of the seeds that both have, and the gains.
-
-    Args:
-        rows: all of them.
-        titles: of both, by the names of their rows.
-    """
-    lines, every, spreads = [], list[float](), list[float]()
-    for scene in SCENES:
-        start = scene if scene == "synthetic" else from_dense(scene)  # which has points of its own
-        before, after = (rows_of(rows, start, name) for name in titles)
-        if start == scene and "plain" in titles:
-            before = references_of(rows, REFERENCES, scene)["plain"]
-        if shared := sorted(before.keys() & after.keys()):
-            figures = [[value(of[seed], "test psnr") for seed in shared] for of in (before, after)]
-            gains = [y - x for x, y in zip(*figures, strict=True)]
-            every += gains
-            spreads += [mean_std(figures[1])[1]] if len(shared) > 1 else []
-            line = {"scene": scene, "seeds": str(len(shared))}
-            line |= {title: format_mean_std(of, decimals=2) for title, of in zip(titles.values(), figures, strict=True)}
-            lines.append(line | {"gain, by seed": ", ".join(f"{x:+.2f}" for x in gains)})
-    if not lines:
-        return "Nothing was trained with both."
-    total = [
-        f"- mean gain over {len(every)} pairs of {len(lines)} scenes: {fmean(every):+.2f} dB",
-        f"- worst pair: {min(every):+.2f} dB",
-    ]
-    if spreads:
-        total.append(f"- standard deviation of seeds, mean over {len(spreads)} scenes: {fmean(spreads):.2f} dB")
-    return "\n".join([markdown_table(lines, [*lines[0]]), "", *total])
-
-
-def seventh(rows: Sequence[Row]) -> str:
-    """Return the table of the seventh choice, of other starts: gains of seed 0 over the usual one, mean of six."""
-    return _gains(rows, COUNTS, seeds=range(6), starts=True)
-
-
-def _gains(
-    rows: Sequence[Row],
-    names: Sequence[str],
-    *,
-    seeds: Sequence[int],
-    tried: Sequence[int] = (0,),
-    figure: Literal["held-out", "shared"] = "held-out",
-    starts: bool = False,
-) -> str:
-    """Return a table of what candidates gain with the dense start: at held-out / test views, and Gaussians.
-
-    Args:
-        rows: all of them.
-        names: of what the candidates add to the recipe, or of the points from which it begins.
-        seeds: of the recipe's trainings over whose mean they gain.
-        tried: the candidates' seeds.
-        figure: whether all pixels of the held-out views count, or the shared ones.
-        starts: whether the names are of points.
-    """
-    lines = []
-    for name in names:
-        line, gains = {"candidate": name}, list[tuple[float, float]]()
-        for scene in HELD_OUT:
-            own = (f"{scene}, {name}", LATER) if starts else (from_dense(scene), f"{LATER} + {name}")
-            before, after = (
-                [(of[s][figure], value(of[s], "test psnr"), of[s]["gaussians"]) for s in who if figure in of.get(s, ())]
-                for of, who in ((rows_of(rows, from_dense(scene), LATER), seeds), (rows_of(rows, *own), tried))
-            )
-            if before and len(after) == len(tried):
-                usual, found = (tuple(map(fmean, zip(*of, strict=True))) for of in (before, after))
-                gains.append((found[0] - usual[0], found[1] - usual[1]))
-                line[scene] = "{:+.2f} / {:+.2f}, {:.2f}".format(*gains[-1], found[2] / usual[2])
-        if gains:
-            means = map(fmean, zip(*gains, strict=True))
-            lines.append(line | {"mean": "{:+.2f} / {:+.2f}".format(*means), "scenes": str(len(gains))})
     columns = ["candidate", *(s for s in HELD_OUT if any(s in line for line in lines)), "mean", "scenes"]
     return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 

@@ -103,55 +103,6 @@ def test_a_candidate_of_the_second_choice_gains_over_the_mean_of_the_seeds():
     assert "flat" not in setting.second(rows, (0, 1))  # no seed 1
 
 
-def test_a_candidate_of_the_later_choices_gains_with_the_start_of_the_recipe():
-    start = "fern, dense and few"
-    rows = [row(start, "from 1,000", seed, 25.0 + seed, 20.0 + seed) for seed in (0, 1, 2)]
-    rows += [row(start, f"from 1,000 + {name}", 0, 26.5, 22.0) for name in ("warp", "rate 0.3")]
-    rows += [row("fern", "from 1,000 + warp", 0, 99.0, 99.0)]
-    for table, gains in ((setting.third, "+2.00 / +1.50, 1.00"), (setting.fourth, "+1.00 / +0.50, 1.00")):
-        (line,) = [x for x in table(rows).splitlines() if x.startswith(("| warp", "| rate"))]
-        assert [x.strip() for x in line.split("|")[2:-1]] == [gains, gains.partition(",")[0], "1"]
-
-
-def test_the_fifth_choice_gains_at_shared_pixels_over_the_later_seeds():
-    start, name = "fern, dense and few", "from 1,000 + warp + hidden left out"
-    rows = [row(start, "from 1,000", seed, 25.0 + seed, 0.0) | {"shared": 20.0 + seed} for seed in (0, 3, 4, 5)]
-    rows += [row(start, name, 0, 30.0, 0.0) | {"shared": 26.0}, row("cape, dense and few", name, 0, 9.0, 0.0)]
-    (line,) = [x for x in setting.fifth(rows).splitlines() if x.startswith("| warp")]
-    assert [x.strip() for x in line.split("|")[2:-1]] == ["+2.00 / +1.00, 1.00", "+2.00 / +1.00", "1"]
-
-
-def test_the_later_choices_gain_over_all_seeds_of_the_recipe():
-    start = "fern, dense and few"
-    rows = [row(start, "from 1,000", seed, 25.0 + seed, 20.0 + seed) for seed in range(6)]
-    rows += [row(start, "from 1,000 + means x4", seed, 28.0 + seed, 23.0 + seed) for seed in (0, 1)]
-    rows += [row("fern, filled", "from 1,000", 0, 27.0, 23.5)]
-    for table, gains in (
-        (setting.sixth(rows), "+0.50 / +0.50"),
-        (setting.sixth(rows, (0, 1)), "+1.00 / +1.00"),
-        (setting.sixth(rows, (0, 2)), None),
-        (setting.seventh(rows), "+1.00 / -0.50"),
-    ):
-        lines = [
-            [x.strip() for x in line.split("|")[2:-1]]
-            for line in table.splitlines()
-            if "means" in line or "filled" in line
-        ]
-        assert lines == ([] if gains is None else [[f"{gains}, 1.00", gains, "1"]])
-
-
-def test_settings_from_the_same_start_are_met_by_seeds_that_both_have():
-    start = "fern, dense and few"
-    rows = [row(start, "plain", seed, 20.0 + seed) for seed in (3, 4)]
-    rows += [row(start, "from 1,000", seed, psnr) for seed, psnr in ((3, 25.0), (4, 23.0), (5, 99.0))]
-    rows += [row("fern", "plain", 5, 20.0)]  # of another start
-    text = setting.by_default(rows)
-    assert "| fern | 2 | 23.50 ± 0.71 | 24.00 ± 1.41 | +2.00, -1.00 |" in text
-    assert "mean gain over 2 pairs of 1 scenes: +0.50 dB" in text
-    assert "worst pair: -1.00 dB" in text
-    assert setting.sixth_judged(rows) == "Nothing was trained with both."
-
-
 def test_a_rate_of_the_means_by_pixels_is_another_on_every_scene():
     names = [
         setting.candidate(with_recipe("sparse", iterations=3_000, means_rate=rate)) for rate in (6.4e-4, 2.5e-4, 5e-4)

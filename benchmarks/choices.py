@@ -1,0 +1,123 @@
+"""The later choices of the setting for few photographs, by the rows of `benchmarks.setting`; see benchmarks/setting.md.
+
+python -m benchmarks.choices benchmarks/data/setting.json
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Literal
+
+from benchmarks.paper.rows import value
+from benchmarks.paper.scenes import SCENES
+from benchmarks.setting import FEWEST, HELD_OUT, LATER, REFERENCES, Row, from_dense, references_of, rows_of
+from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
+
+__all__ = ["BY_DEFAULT", "CHOICES", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "tables"]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Candidates of a choice, and what they are held against.
+
+    Args:
+        names: of what the candidates add to the recipe, or of the points from which it begins.
+        seeds: of the recipe's trainings over whose mean they gain.
+        tried: the candidates' seeds.
+        figure: whether all pixels of the held-out views count, or the shared ones.
+        starts: whether the names are of points.
+    """
+
+    names: tuple[str, ...]
+    seeds: Sequence[int]
+    tried: tuple[int, ...] = (0,)
+    figure: Literal["held-out", "shared"] = "held-out"
+    starts: bool = False
+
+
+_HIDDEN = "warp + hidden left out"
+_WARPS = ("warp", "warp + no smoothness", _HIDDEN, f"{_HIDDEN} + no smoothness")
+_RATES = ("means x4", "means x1/4", "means by pixels", "opacities x1/2", "scales x1/2", "colors x1/2")
+_COUNTS = ("5,000 dense and few", "8,000 dense and few", "30,000 dense and few", "filled")
+CHOICES = {
+    "third": Choice(("rate 0.3", "no reset", "threshold 3e-4"), seeds=(0,)),
+    "fourth": Choice((*_WARPS, "depth of the points"), seeds=range(FEWEST)),
+    "fifth": Choice((_HIDDEN, f"{_HIDDEN} + every second step"), seeds=range(3, 6), figure="shared"),
+    "sixth": Choice(_RATES, seeds=range(6)),
+    "sixth, second round": Choice(_RATES, seeds=range(6), tried=(0, 1)),
+    "seventh": Choice(_COUNTS, seeds=range(6), starts=True),
+}
+SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
+"""The judgement of the sixth choice, for `from_same_start`."""
+BY_DEFAULT = {"plain": "plain", LATER: "recipe"}
+"""What the recipe gains from the start that a user has, for `from_same_start`."""
+
+
+def tables(rows: Sequence[Row]) -> list[str]:
+    """Return all tables of the later choices."""
+    gained = [gains_of(rows, choice) for choice in CHOICES.values()]
+    return [*gained, *(from_same_start(rows, titles) for titles in (SLOWER_MEANS, BY_DEFAULT))]
+
+
+def gains_of(rows: Sequence[Row], choice: Choice) -> str:
+    """Return a table of what candidates gain with the dense start: at held-out / test views, and Gaussians."""
+    lines, figure = [], choice.figure
+    for name in choice.names:
+        line, gains = {"candidate": name}, list[tuple[float, float]]()
+        for scene in HELD_OUT:
+            own = (f"{scene}, {name}", LATER) if choice.starts else (from_dense(scene), f"{LATER} + {name}")
+            recipe, found = rows_of(rows, from_dense(scene), LATER), rows_of(rows, *own)
+            before, after = (
+                [(of[s][figure], value(of[s], "test psnr"), of[s]["gaussians"]) for s in who if figure in of.get(s, ())]
+                for of, who in ((recipe, choice.seeds), (found, choice.tried))
+            )
+            if before and len(after) == len(choice.tried):
+                usual, new = (tuple(map(fmean, zip(*of, strict=True))) for of in (before, after))
+                gains.append((new[0] - usual[0], new[1] - usual[1]))
+                line[scene] = "{:+.2f} / {:+.2f}, {:.2f}".format(*gains[-1], new[2] / usual[2])
+        if gains:
+            means = map(fmean, zip(*gains, strict=True))
+            lines.append(line | {"mean": "{:+.2f} / {:+.2f}".format(*means), "scenes": str(len(gains))})
+    columns = ["candidate", *(s for s in HELD_OUT if any(s in line for line in lines)), "mean", "scenes"]
+    return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
+
+
+def from_same_start(rows: Sequence[Row], titles: Mapping[str, str]) -> str:
+    """Return a table of two settings with the dense start: test PSNR of the seeds that both have, and the gains.
+
+    Args:
+        rows: all of them.
+        titles: of both, by the names of their rows.
+    """
+    lines, every, spreads = [], list[float](), list[float]()
+    for scene in SCENES:
+        start = scene if scene == "synthetic" else from_dense(scene)  # which has points of its own
+        before, after = (rows_of(rows, start, name) for name in titles)
+        if start == scene and "plain" in titles:
+            before = references_of(rows, REFERENCES, scene)["plain"]
+        if shared := sorted(before.keys() & after.keys()):
+            figures = [[value(of[seed], "test psnr") for seed in shared] for of in (before, after)]
+            gains = [y - x for x, y in zip(*figures, strict=True)]
+            every += gains
+            spreads += [mean_std(figures[1])[1]] if len(shared) > 1 else []
+            line = {"scene": scene, "seeds": str(len(shared))}
+            line |= {title: format_mean_std(of, decimals=2) for title, of in zip(titles.values(), figures, strict=True)}
+            lines.append(line | {"gain, by seed": ", ".join(f"{x:+.2f}" for x in gains)})
+    if not lines:
+        return "Nothing was trained with both."
+    total = [
+        f"- mean gain over {len(every)} pairs of {len(lines)} scenes: {fmean(every):+.2f} dB",
+        f"- worst pair: {min(every):+.2f} dB",
+    ]
+    if spreads:
+        total.append(f"- standard deviation of seeds, mean over {len(spreads)} scenes: {fmean(spreads):.2f} dB")
+    return "\n".join([markdown_table(lines, [*lines[0]]), "", *total])
+
+
+if __name__ == "__main__":
+    print(*tables(json.loads(Path(sys.argv[1]).read_text("utf-8"))), sep="\n\n")
