@@ -54,7 +54,8 @@ class Evaluate:
 
     def __call__(self) -> None:
         from reference_trainer.evaluation.lpips import load_lpips
-        from reference_trainer.runs.measure import load_run_model, log_what_hangs, measure
+        from reference_trainer.runs.guarded import log_what_hangs, removed_from
+        from reference_trainer.runs.measure import load_run_model, measure
         from reference_trainer.runs.ply import score_ply
         from reference_trainer.scenes.virtual_cameras import measured_views
 
@@ -67,8 +68,11 @@ class Evaluate:
         if place is None:
             model, scene = load_run_model(self.run, self.device, regularizer=self.regularizer, trust=trust)
             name = "evaluation" if self.regularizer is None else f"evaluation_{folder_name(self.regularizer)}"
-            measure(model, measured_views(scene), self.out or self.run / name, about={"scene": scene.name}, **shared)
-            log_what_hangs(model, scene)
+            out = self.out or self.run / name
+            measure(model, measured_views(scene), out, about={"scene": scene.name}, **shared)
+            for line in removed_from(self.run):
+                print(line)
+            log_what_hangs(model, scene, out)
         else:
             shared |= {"regularizer": self.regularizer, "device": self.device, "background": self.scene.background}
             score_ply(self.run, place, self.out, trust=trust, **shared)

@@ -20,7 +20,7 @@ from reference_trainer.scenes.virtual_cameras import amid_views, unseen_views
 
 __all__ = [
     "PER_WEIGHT_SCALE", "Guard", "Heat", "all_but_highest", "blend_weights", "colored_by", "concentration", "guard",
-    "mean_shares", "share_per_weight", "unseen_shares",
+    "mean_shares", "share_per_weight", "unseen_shares", "where_it_shows",
 ]  # fmt: skip
 
 PER_WEIGHT_SCALE = (0.1, 10.0)
@@ -141,6 +141,27 @@ def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None =
             break
         keep[keep.clone()] = ~hang
     return Guard(keep, where, tuple(scores))
+
+
+@torch.no_grad()
+def where_it_shows(model: TrainedModel, scene: Scene, found: Guard) -> tuple[Viewpoint, Tensor, Tensor]:
+    """Return the camera at which what hangs shows most, and its renders with it and without, (3, H, W) in [0, 1].
+
+    That is the camera, of those where something hangs, whose picture changes most, in the mean square.
+
+    Raises:
+        ValueError: if nothing hangs.
+    """
+    freed = replace(model, gaussians=model.gaussians[found.keep])
+    shown = list[tuple[float, Viewpoint, Tensor, Tensor]]()
+    for view in [*unseen_views(scene), *amid_views(scene)]:
+        if view.name in found.where:
+            at = view.to(model.background.device)
+            before, after = (each.test_rendering(at).image.clamp(0, 1) for each in (model, freed))
+            shown.append(((before - after).square().mean().item(), view, before, after))
+    if not shown:
+        raise ValueError("nothing hangs where nobody took a photograph: there is nothing to show.")
+    return max(shown, key=lambda one: one[0])[1:]
 
 
 def unseen_shares(model: TrainedModel, views: Sequence[Viewpoint]) -> tuple[Tensor, Tensor, float]:

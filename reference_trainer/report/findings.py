@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,14 @@ from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.evaluate import ca_picture, error_picture, expected_error_picture
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.pictures import heat_colors
-from reference_trainer.evaluation.shares import Guard, Heat, concentration, guard
+from reference_trainer.evaluation.shares import Heat, concentration, guard
 from reference_trainer.evaluation.tables import EXACT
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.report.packing import heat_uri, image_uri, quantized
+from reference_trainer.runs.folder import GUARD_PICTURE
+from reference_trainer.runs.guarded import hanging_picture, removed_from
 from reference_trainer.runs.measure import load_run_model
+from reference_trainer.scenes.images import read_image
 from reference_trainer.scenes.load import evenly_spaced
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 from reference_trainer.scenes.virtual_cameras import measured_views, unseen_views
@@ -48,7 +51,9 @@ class Findings:
         heat: of the exact score over these views; None if there is no score to attribute.
         notes: what is missing, and why.
         unseen: cameras that nobody took, with what is expected there.
-        hangs: what hangs there; None for a model that cannot be guarded.
+        hangs: a line about what hangs there, None if nothing does or the model cannot be guarded.
+        removed: a line for each time that the guard removed what hung while the model trained.
+        veils: pictures, as data URIs by what they show, of the worst place with and without what hung or hangs.
     """
 
     label: str
@@ -60,7 +65,9 @@ class Findings:
     heat: Heat | None
     notes: list[str]
     unseen: Sequence[tuple[Viewpoint, ErrorMap]] = ()
-    hangs: Guard | None = None
+    hangs: str | None = None
+    removed: Sequence[str] = ()
+    veils: Mapping[str, str] = field(default_factory=dict)
 
     def packed(self, low: float, high: float) -> dict[str, Any]:
         """Return the model as the page draws it: its Gaussians in the order of their heat, those of least heat first.
@@ -154,16 +161,19 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Colle
         own = any(view is each for each in chosen["train"])
         expected = None if own else errors(view, view.mask if isinstance(view, View) else None)
         pictures.append(pictures_of(model, view, expected, result))
-    unseen, hangs = [], None
+    unseen, hangs, removed, veils = [], None, removed_from(run), dict[str, str]()
+    if removed and (picture := run / GUARD_PICTURE).exists():
+        veils["what the guard removed"] = image_uri(read_image(picture)[0])
     if len(scene.train) > 1:
         places = unseen_views(scene)
         places = [places[i].to(device) for i in evenly_spaced(len(places), min(MOST_UNSEEN, len(places)))]
         unseen = [(place, errors(place)) for place in places]
-        hangs = guard(model, scene, places) if len(model.chain) else None
+        if len(model.chain) and (still := guard(model, scene)).where:  # at all places, as `ca-reg evaluate` looks
+            hangs, veils["what hangs there"] = str(still), image_uri(hanging_picture(model, scene, still))
     else:
         notes.append(f"{label}: no views that you did not take, because none lies between or beyond a single camera.")
     opacities = model.without_camera.test_opacities
-    return Findings(label, model, opacities, scene, chosen, pictures, heat, notes, unseen, hangs)
+    return Findings(label, model, opacities, scene, chosen, pictures, heat, notes, unseen, hangs, removed, veils)
 
 
 @torch.no_grad()

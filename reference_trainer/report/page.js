@@ -184,6 +184,7 @@ refreshAll();
 if (data.views.some(view => view.photograph)) $("ranges").append(bar("error and expected error (mean over the colors)", "0", `${data.ends.error} or more`));
 if (data.unseen.length) $("ranges-unseen").append(bar("expected error (of colors in [0, 1], mean over them)", "0", `${data.ends.error} or more`));
 else $("unseen").remove();
+for (const { src, caption } of data.veils) $("veils").append(make("figure", {}, make("img", { src, alt: caption }), make("figcaption", {}, caption)));
 if (data.attribution) $("ranges").append(bar("CA map (variance, half left out); gray does not count", "0", `${data.ends.ca} or more`));
 
 // The models, and one camera for all of them.

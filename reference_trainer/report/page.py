@@ -227,6 +227,9 @@ def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Pa
         "ends": {"heat": [f"{low:.2g}", f"{high:.2g}"], "error": ERROR_PICTURE_RANGE, "ca": CA_PICTURE_RANGE},
         "views": _views(found),
         "unseen": _unseen(found),
+        "veils": [
+            {"caption": f"{each.label}: {what}", "src": uri} for each in found for what, uri in each.veils.items()
+        ],
         "flight": _flight(found[0]),
         "runs": [each.packed(low, high) | {"color": colors[each.label]} for each in found],
     }
@@ -382,12 +385,13 @@ def _unseen(found: Sequence[Findings]) -> list[dict[str, Any]]:
 
 
 def _hanging(each: Findings, run: Path, options: SceneOptions) -> list[str]:
-    """Return a line on what hangs where nobody took a photograph, and how to remove it."""
-    if each.hangs is None or not each.hangs.where:
-        return []
+    """Return lines on what hung where nobody took a photograph, what still hangs there, and how to remove it."""
+    lines = [f"{each.label}: {line}" for line in each.removed]
+    if each.hangs is None:
+        return lines
     command = ["ca-reg", "clean", str(run / PLY), "--scene", options.path, "--hanging"]
     for name, usual in dataclasses.asdict(SceneOptions()).items():
         if (x := getattr(options, name)) != usual and name not in ("path", "init"):  # a PLY is its own beginning
             flag = name.replace("_", "-")
             command += [f"--{flag}" if x else f"--no-{flag}"] if isinstance(x, bool) else [f"--{flag}", str(x)]
-    return [f"{each.label}: {each.hangs} To remove them: {shlex.join(command)}"]
+    return [*lines, f"{each.label}: {each.hangs} To remove them: {shlex.join(command)}"]

@@ -21,9 +21,9 @@ from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig, saved_config
 
 __all__ = [
-    "BAKED_PLY", "CHECKPOINT", "COMPARISON", "CONFIG", "LOCK", "PLAN", "PLY", "RESULTS", "SCENE", "VIEWS",
-    "FolderInUseError", "check_output", "check_run", "check_trusted", "folder_name", "modules_named", "read_results",
-    "read_run_settings", "report_file", "run_lock", "run_settings", "runs_of", "settings_of_run",
+    "BAKED_PLY", "CHECKPOINT", "COMPARISON", "CONFIG", "GUARD", "GUARD_PICTURE", "LOCK", "PLAN", "PLY", "RESULTS",
+    "SCENE", "VIEWS", "FolderInUseError", "check_output", "check_run", "check_trusted", "folder_name", "modules_named",
+    "read_results", "read_run_settings", "report_file", "run_lock", "run_settings", "runs_of", "settings_of_run",
 ]  # fmt: skip
 
 CONFIG = "config.json"
@@ -31,6 +31,8 @@ PLAN = "plan.json"
 CHECKPOINT = "checkpoint.pt"
 PLY = "point_cloud.ply"
 BAKED_PLY = "point_cloud_for_viewers.ply"
+GUARD = "guard.json"  # what the guard removed while training
+GUARD_PICTURE = "guard.png"
 VIEWS = "views"  # here and in the folder of an evaluation
 RESULTS = "results.json"
 COMPARISON = "comparison.json"  # of several runs
@@ -99,7 +101,7 @@ def settings_of_run(
     if not (out / CONFIG).exists():
         if trained:
             raise ValueError(f"{out} holds a {CHECKPOINT} but no {CONFIG}: give another folder, or delete this one.")
-        check_output(out, options.path, (PLY, BAKED_PLY, RESULTS, VIEWS, COMPARISON))
+        check_output(out, options.path, (PLY, BAKED_PLY, RESULTS, GUARD, GUARD_PICTURE, VIEWS, COMPARISON))
         return None
     if auto and (out / PLAN).exists():
         from reference_trainer.training.plan import Plan  # needs torch

@@ -17,7 +17,6 @@ from reference_trainer.evaluation.evaluate import Evaluation, evaluate, expected
 from reference_trainer.evaluation.lpips import LPIPS
 from reference_trainer.evaluation.pictures import PANEL, file_names, is_own_png, save_film, save_png
 from reference_trainer.evaluation.results import PARTIAL, machine, write_json
-from reference_trainer.evaluation.shares import guard
 from reference_trainer.evaluation.tables import evaluation_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import remove_leftovers, write_text
@@ -27,7 +26,7 @@ from reference_trainer.scenes.scene import Scene, Viewpoint
 from reference_trainer.scenes.virtual_cameras import interpolate_cameras, measured_views
 from reference_trainer.threads import threads_for
 
-__all__ = ["load_run_model", "log_what_hangs", "measure", "render_run"]
+__all__ = ["load_run_model", "measure", "render_run"]
 
 EVALUATION = "evaluation.json"
 _log = logging.getLogger(__name__)
@@ -108,14 +107,6 @@ def _remove_other_pictures(folder: Path, views: Mapping[str, Sequence[Viewpoint]
             path.unlink()
     for split in {path for path in folder.iterdir() if path.is_dir() and not any(path.iterdir())}:
         split.rmdir()
-
-
-def log_what_hangs(model: TrainedModel, scene: Scene | None) -> None:
-    """Log what hangs where nobody took a photograph, if the model is one that can be guarded and there are cameras."""
-    if scene is not None and len(scene.train) > 1 and len(model.chain):
-        with threads_for(scene.pixels):
-            found = guard(model, scene)
-        _log.info("%s%s", found, " To remove them: ca-reg clean PLY --hanging --scene FOLDER." if found.where else "")
 
 
 @torch.no_grad()

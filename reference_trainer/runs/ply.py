@@ -22,7 +22,8 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
 from reference_trainer.runs.folder import VIEWS, check_trusted
-from reference_trainer.runs.measure import log_what_hangs, measure
+from reference_trainer.runs.guarded import log_what_hangs
+from reference_trainer.runs.measure import measure
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.images import image_size
 from reference_trainer.scenes.options import BACKGROUNDS, OrbitOptions, SceneOptions
@@ -189,7 +190,7 @@ def score_ply(
     folder, scene = out or ply.with_name(ply.stem + "_evaluation"), loaded.scene
     shared: dict[str, Any] = {"samples": samples, "seed": seed, "perceptual": perceptual}
     result = measure(loaded.model, loaded.views, folder, about=loaded.about, **shared)
-    log_what_hangs(loaded.model, scene)
+    log_what_hangs(loaded.model, scene, folder)
     if scene is None:
         _log.info(
             "An orbit sees the model from where no photograph may have been taken: compare these scores with others "

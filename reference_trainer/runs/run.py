@@ -41,6 +41,7 @@ from reference_trainer.runs.folder import (
     run_settings,
     settings_of_run,
 )  # fmt: skip
+from reference_trainer.runs.guarded import keep_removed
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
@@ -313,6 +314,8 @@ def _train(
             if monitor is not None:
                 monitor(step, trainer.gaussians.opacities)
                 _write_curves(monitor, trainer)
+            if trainer.removed is not None:  # before the checkpoint, which does not know it any more
+                keep_removed(out, step, trainer.removed[0], trainer.scene, trainer.removed[1])
             if step % monitoring.checkpoint_every == 0 or step == last:
                 trainer.save(out / CHECKPOINT)
             on_step(trainer)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ca_reg import Chain
-from reference_trainer.evaluation.shares import guard
+from reference_trainer.evaluation.shares import Guard, guard
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.progress import progress_bar
@@ -52,6 +52,7 @@ class Trainer:
         optimizer: of the first model.
         density: likewise.
         regularizer: likewise.
+        removed: of the first model, as it was before, what the guard removed after the last step; None if nothing.
 
     Raises:
         ValueError: if the photographs lack what a term of the loss compares with, or show a background where it is to
@@ -80,6 +81,7 @@ class Trainer:
         self.step = 0
         self.seconds = self.processor_seconds = 0.0
         self.loss = math.nan
+        self.removed: tuple[TrainedModel, Guard] | None = None
         self._shown: tuple[Tensor, Tensor] | None = None  # the last render, and its photograph
         self.views = [view.to(self.device) for view in scene.train]
         self.background = scene.background.to(self.device)
@@ -197,6 +199,7 @@ class Trainer:
         self.step += 1
         self.loss = value
         self._shown = steps[0].image.detach(), steps[0].view.image
+        self.removed = None
         if self._guards:
             self._guard()
         steps.clear()  # each step refers to all: a cycle would keep their graphs until garbage collection
@@ -292,6 +295,8 @@ class Trainer:
             if found.where:
                 _log.info("step %d: %s", self.step, found)
                 model.density.select(model.optimizer, found.keep)
+                if model is self.models[0]:
+                    self.removed = rendered, found
 
     def _begin_steps(self) -> list[Step]:
         """Choose the view of the step and what regularizes it; return a `Step` for every model."""

@@ -4,7 +4,6 @@ import re
 import shutil
 import zlib
 from base64 import b64decode
-from collections import Counter
 from io import BytesIO
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from reports import Parsed, two_of_each, unfinished
 from ca_reg.monitor import LOG_NAME, read_dynamics
 from reference_trainer.cli import main
 from reference_trainer.evaluation.results import write_json
-from reference_trainer.evaluation.shares import Guard, Heat, blend_weights, mean_shares, share_per_weight
+from reference_trainer.evaluation.shares import Heat, blend_weights, mean_shares, share_per_weight
 from reference_trainer.report import page as page_module
 from reference_trainer.report.findings import find
 from reference_trainer.report.packing import quantized
@@ -141,11 +140,12 @@ def test_the_worst_views_that_nobody_took_come_first(found, monkeypatch):
 
 
 def test_the_page_tells_what_hangs_and_how_to_remove_it(found, options, tmp_path):
-    hangs = Guard(torch.tensor([True, False]), Counter({"between a and b": 1}), (2e-3, 1e-3))
-    (line,) = page_module._hanging(dataclasses.replace(found, hangs=hangs), tmp_path, options)
+    hangs = dataclasses.replace(found, hangs="1 of 2 Gaussians hang.", removed=["Removed after step 9: 3."])
+    first, line = page_module._hanging(hangs, tmp_path, options)
+    assert "after step 9" in first
     assert "1 of 2 Gaussians hang" in line
     assert f"ca-reg clean {tmp_path}/point_cloud.ply --scene synthetic --hanging --downscale 8" in line
-    assert page_module._hanging(dataclasses.replace(found, hangs=None), tmp_path, options) == []
+    assert page_module._hanging(found, tmp_path, options) == []
 
 
 def test_the_models_are_those_of_the_runs(pair):

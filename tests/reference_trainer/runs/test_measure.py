@@ -16,7 +16,7 @@ from reference_trainer.evaluation.tables import EXACT, evaluation_table
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs import measure as measure_module
 from reference_trainer.runs.folder import BAKED_PLY, PLY, FolderInUseError, run_lock
-from reference_trainer.runs.measure import load_run_model, log_what_hangs, measure, render_run
+from reference_trainer.runs.measure import load_run_model, measure, render_run
 from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes.images import read_image
 from reference_trainer.training.config import TrainConfig
@@ -115,17 +115,6 @@ def test_the_folder_is_locked_until_the_last_file_has_changed(run, tmp_path, mon
     measure(model, {"test": scene.test[:1]}, tmp_path, about={})
     assert touched == ["evaluation.json", "evaluation.md", "evaluation.partial.json"]
     assert not (tmp_path / PARTIAL).exists()
-
-
-def test_an_evaluation_tells_what_hangs_where_it_can_tell(run, said):
-    model, scene = load_run_model(run[0])
-    log_what_hangs(model, scene)
-    assert any("where nobody took a photograph" in text for text in said)
-    count = len(said)
-    log_what_hangs(dataclasses.replace(model, regularizer=""), scene)  # a plain model is not guarded
-    log_what_hangs(model, None)
-    log_what_hangs(model, dataclasses.replace(scene, train=scene.train[:1]))
-    assert len(said) == count
 
 
 def test_the_seed_decides_the_masks(run, tmp_path):
