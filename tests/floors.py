@@ -17,7 +17,8 @@ FLOORS = (
     {"render"},  # which thereby knows neither scenes nor the model
     {"renderers", "model"},
     {"scenes"},  # which may begin with a model
-    {"training", "evaluation"},
+    {"evaluation"},
+    {"training"},
     {"runs"},
     {"report", "viewer", "studies", "compat"},
     {"cli"},

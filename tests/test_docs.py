@@ -67,4 +67,4 @@ def test_named_tests_exist():
         path for page in PAGES.values() for path in re.findall(r"`([\w/]*\btest_\w+\.py)`", page.read_text("utf-8"))
     }
     assert named
-    assert not [path for path in named if not (ROOT / "tests" / path).is_file()]
+    assert not [path for path in named if not (ROOT / path).is_file()]

@@ -7,7 +7,7 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
-from floors import FLOORS, Graph, circle, import_graph, rooms, upward
+from floors import FLOORS, Graph, circle, import_graph, rooms, sources, upward
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +31,17 @@ def test_no_arrow_points_upward(graph):
 def test_integrations_need_ca_reg_alone_and_ca_reg_nothing(graph):
     assert rooms(graph)["ca_reg"] == set()
     assert rooms(graph)["integrations"] == {"ca_reg"}
+
+
+def test_nothing_that_is_installed_imports_what_only_a_checkout_has():
+    for name, path in sources(Path(__file__).parents[1]).items():
+        tops = set[str]()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                tops |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                tops.add((node.module or "").partition(".")[0])
+        assert not tops & {"tests", "benchmarks"}, name
 
 
 def test_there_is_no_circle_between_modules(graph):

@@ -27,6 +27,7 @@ PER_WEIGHT_SCALE = (0.1, 10.0)
 """Ends of the color scale for shares per blend weight, in units of the mean."""
 
 _TOP = (0.001, 0.01, 0.1)
+_TOLD = 5  # places that a sentence names
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,9 @@ class Guard:
     def __str__(self) -> str:
         if not self.where:
             return "No Gaussian hangs where nobody took a photograph."
-        places = "; ".join(f"{count} {name}" for name, count in self.where.most_common())
+        told = self.where.most_common(_TOLD)
+        others = self.where.total() - sum(count for _, count in told)
+        places = "; ".join([f"{count} {name}" for name, count in told] + [f"{others} elsewhere"] * bool(others))
         before, after = self.scores[0] * 1e3, self.scores[-1] * 1e3
         total = f"{self.where.total()} of {len(self.keep)} Gaussians hang where nobody took a photograph: {places}"
         return f"{total}. Without them the exact score there is {after:.2f}e-3, for {before:.2f}e-3."

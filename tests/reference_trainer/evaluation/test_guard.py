@@ -2,6 +2,7 @@
 
 import math
 import weakref
+from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
 
@@ -12,7 +13,7 @@ from ca_reg import attribute
 from reference_trainer.camera import Camera
 from reference_trainer.evaluation import shares as shares_module
 from reference_trainer.evaluation.metrics import psnr
-from reference_trainer.evaluation.shares import guard, unseen_shares
+from reference_trainer.evaluation.shares import Guard, guard, unseen_shares
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.runs.run import model_of
@@ -99,6 +100,13 @@ def planted_model(scene: Scene) -> TrainedModel:
     start = initial_gaussians(scene, TrainConfig())
     opaque = replace(start, opacity_logits=torch.full_like(start.opacity_logits, 2.0))
     return TrainedModel(together(opaque, veil(scene)), scene.background, "dropout(0.2)")
+
+
+def test_few_places_are_named_and_the_others_counted():
+    found = Guard(torch.zeros(28, dtype=torch.bool), Counter({f"at {i}": 7 - i for i in range(7)}), (2e-3, 1e-3))
+    assert "28 of 28" in str(found)
+    assert "3 at 4; 3 elsewhere" in str(found)
+    assert "at 5" not in str(found)
 
 
 def test_a_model_without_a_regularizer_is_refused(scene):
