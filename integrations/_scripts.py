@@ -302,7 +302,7 @@ class Watch:
         if event == "open":
             path, mode = str(arguments[0]), str(arguments[1])
             if "w" in mode and path.endswith(_MODELS) and not path.endswith(_POINTS):
-                self.saved = path
+                self.saved = os.path.abspath(path)  # the script may change the working directory
         elif event == "os.system":
             self._check(os.fsdecode(arguments[0]), os.environ)
         elif event == "subprocess.Popen":

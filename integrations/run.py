@@ -18,6 +18,7 @@ import argparse
 import atexit
 import json
 import os
+import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -58,7 +59,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Exceptions of the script, SystemExit included, pass through.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    options = _parse(arguments)
+    options, watch = _parse(arguments), Watch()
+    try:
+        _launch(options, arguments, watch)
+    except SystemExit as ended:
+        if ended.code or options.guard is None:
+            raise
+    if options.guard is not None:
+        _guard(options, watch.saved)
+
+
+def _launch(options: argparse.Namespace, arguments: Sequence[str], watch: Watch) -> None:
+    """Run the script, hooked, and report how it ended."""
     hook: Hook | None = options.hook
     set_command_line(options.script, options.arguments)
     with ExitStack() as undo:
@@ -68,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             name = ["-m", options.script] if options.module else [str(options.script.resolve())]
             own = arguments[: len(arguments) - len(options.arguments) - (2 if options.module else 1)]
             undo.enter_context(in_children(f"{__package__}.run:resume", own, name))
-        watch = undo.enter_context(Watch())
+        undo.enter_context(watch)
         undo.enter_context(old_aliases())
         undo.enter_context(_reported(options, hook, watch))
         if options.cpu:
@@ -80,6 +92,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
             hook.install()
             undo.callback(_uninstall, hook)
         run_script(options.script)
+
+
+def _guard(options: argparse.Namespace, saved: str | None) -> None:
+    """Write the model that the script wrote last again, without what hangs where nobody took a photograph."""
+    if saved is None or not saved.endswith(".ply"):
+        raise SystemExit("[ca_reg] ERROR: --guard: the script was not seen to write a .ply, and nothing was removed.")
+    rates = [("dropout", options.dropout), ("noise", options.noise)]
+    trained = [options.regularizer, *(f"{name}({rate})" for name, rate in rates if rate is not None)]
+    # A process of its own, in which nothing is hooked and no stand-in takes a library's place.
+    command = ["-m", "reference_trainer.cli", "clean", saved, "--scene", str(options.guard), "--hanging"]
+    command += ["--regularizer", " + ".join(filter(None, trained))]
+    code = subprocess.run([sys.executable, *command], check=False).returncode
+    if code:
+        raise SystemExit(code)
 
 
 def resume(arguments: Sequence[str], script: Sequence[str]) -> None:
@@ -129,6 +155,8 @@ def _parse(arguments: Sequence[str] | None, *, in_child: bool = False) -> argpar
     add("--ramp", type=int, metavar="STEPS", help="raise both rates linearly from 0 over so many steps after --start")
     add("--scope", choices=get_args(Scope), default="main", help="a step's first training render and its batch, or all")
     add("--seed", type=int, default=0, help="of masks and noise (default: 0); the script's random numbers are its own")
+    add("--guard", type=Path, metavar="SCENE", help="afterwards write the last .ply again, as *_clean.ply, without "
+        "what hangs where no camera of this scene looked (ca_reg[trainer])")  # fmt: skip
     add("--report", type=Path, metavar="FILE", help="write what was done as JSON, too")
     add("--cpu", action="store_true", help="run without CUDA, by a stand-in for the code base's rasterizer or gsplat's")
     add("--rasterizer", metavar="MODULE:CLASS", help="the class that renders, if it is not found in the source")
@@ -171,6 +199,12 @@ def _parse(arguments: Sequence[str] | None, *, in_child: bool = False) -> argpar
         options.report = options.report.absolute()  # the script may change the working directory
         if not options.report.parent.is_dir():
             parser.error(f"there is no folder {options.report.parent} for the report")
+    if options.guard is not None:
+        options.guard = options.guard.absolute()
+        if not options.guard.is_dir():
+            parser.error(f"there is no scene {options.guard} for --guard")
+        if find_spec("reference_trainer.runs") is None or find_spec("tyro") is None:
+            parser.error("--guard needs the trainer: pip install 'ca_reg[trainer]'")
     if options.rasterizer is not None and options.rasterizer.count(":") != 1:
         parser.error(f"--rasterizer must be module:Class, got {options.rasterizer}")
     if options.outputs is not None and not options.cpu:
@@ -181,6 +215,8 @@ def _parse(arguments: Sequence[str] | None, *, in_child: bool = False) -> argpar
         options.hook = _hook(options)
     except (TypeError, ValueError) as error:
         parser.error(str(error))
+    if options.guard is not None and options.hook is None:
+        parser.error("--guard is for what --dropout, --noise or --regularizer leave: a plain model needs all it has")
     return options
 
 

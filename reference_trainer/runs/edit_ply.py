@@ -161,12 +161,15 @@ def clean_ply(
     else:
         views = [view.to(device) for view in loaded.views["orbit" if scene is None else "train"]]
         stays = all_but_highest(Heat.of(model, views).values, fraction)
-    models = {"as it was": model, "taken out": replace(model, gaussians=model.gaussians[stays])}
+    taken = model if bool(stays.all()) else replace(model, gaussians=model.gaussians[stays])
+    models = {"as it was": model, "taken out": taken}
     if scene is None:
         _log.info("Without photographs nothing can close the holes: for that give the scene (--scene FOLDER).")
     elif refine:
         models[f"after {refine} steps"] = refined(models["taken out"], scene, refine, device)
-    found = {name: evaluate(each, loaded.views) for name, each in models.items()}
+    found: dict[str, Evaluation] = {}
+    for name, each in models.items():  # one that nothing was taken out of has been measured
+        found[name] = found["as it was"] if each is model and found else evaluate(each, loaded.views)
     *_, last = models.values()
     save_ply(scaled(last.gaussians, 1 / loaded.enlarged), out, regularizer=last.regularizer, step=last.step)
     _log.info(_table(found))

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -19,6 +20,14 @@ from ca_reg.integrations._scripts import find_script
 from ca_reg.integrations.gsplat import Installation
 from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.integrations.run import _parse, main
+from reference_trainer.evaluation.pictures import save_png
+from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.model.ply import load_ply, save_ply
+from reference_trainer.scenes import synthetic_scene
+from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.virtual_cameras import unseen_views
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.model_state import initial_gaussians
 
 
 def test_a_script_is_regularized_and_the_report_says_how(repository, tmp_path, capsys):
@@ -335,6 +344,8 @@ def test_an_installed_command_is_a_script_as_well(tmp_path, monkeypatch):
         (["--dropout", "0.2", "--seed", "-1", "SCRIPT"], "seed must be at least 0"),
         (["--outputs", "2", "SCRIPT"], "which --cpu asks for"),
         (["--report", "nowhere/x.json", "SCRIPT"], "there is no folder"),
+        (["--dropout", "0.2", "--guard", "nowhere", "SCRIPT"], "there is no scene .*nowhere for --guard"),
+        (["--guard", ".", "SCRIPT"], "a plain model needs all it has"),
         (["--drop", "0.2", "SCRIPT"], "unrecognized arguments|no script"),
     ],
 )
@@ -344,6 +355,58 @@ def test_wrong_options_are_refused_before_anything_runs(repository, capsys, argu
     assert code == 2
     assert captured.out == ""
     assert re.search(message, captured.err)
+
+
+def write_scene(folder: Path, scene: Scene) -> None:
+    """Write the training views as nerfstudio does: photographs, and a transforms.json with OpenGL's axes."""
+    frames = []
+    for view in scene.train:
+        save_png(folder / "images" / f"{view.name}.png", view.image)
+        pose = torch.linalg.inv(view.camera.world_to_camera) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+        frames.append({"file_path": f"images/{view.name}.png", "transform_matrix": pose.tolist()})
+    camera = scene.train[0].camera
+    intrinsics = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    size = {"w": camera.width, "h": camera.height}
+    (folder / "transforms.json").write_text(json.dumps(intrinsics | size | {"frames": frames}))
+
+
+@pytest.mark.slow
+def test_a_guarded_model_is_written_again_without_what_hangs(repository, tmp_path, monkeypatch):
+    """The script writes two models and leaves its folder: the launcher cleans the later one of them."""
+    scene, work = synthetic_scene(width=48, height=36, points=400), tmp_path / "work"
+    write_scene(tmp_path / "scene", scene)
+    start = initial_gaussians(scene, TrainConfig())
+    start = replace(start, opacity_logits=start.opacity_logits + 3)
+    beyond = [view.camera for view in unseen_views(scene) if view.name.startswith("beyond train_0")]
+    veil = replace(
+        start[: len(beyond)],
+        means=torch.stack([camera.position + 0.4 * camera.forward for camera in beyond]),
+        log_scales=torch.full((len(beyond), 3), -2.5),
+        opacity_logits=torch.full((len(beyond),), 6.0),
+    )
+    named = dict(veil.named())
+    both = Gaussians.from_named({name: torch.cat([x, named[name]]) for name, x in start.named()})
+    save_ply(both, tmp_path / "trained.ply")
+    script, trained = repository / "train.py", str(tmp_path / "trained.ply")
+    saves = f"""    for name in ("first.ply", "last.ply"):
+        with open(name, "wb") as out, open({trained!r}, "rb") as model:
+            out.write(model.read())
+    __import__("os").chdir("/")
+    sys.exit("""
+    script.write_text(script.read_text().replace("    sys.exit(", saves))
+    work.mkdir()
+    monkeypatch.chdir(work)
+    main([str(x) for x in ("--dropout", 0.2, "--guard", tmp_path / "scene", script, 1)])
+    assert sorted(path.name for path in work.iterdir()) == ["first.ply", "last.ply", "last_clean.ply"]
+    cleaned = load_ply(work / "last_clean.ply")
+    assert cleaned.regularizer == "dropout(0.2)"
+    left = {tuple(row) for row in cleaned.gaussians.means.tolist()}
+    assert {tuple(row) for row in start.means.tolist()} <= left
+    assert sum(tuple(row) in left for row in veil.means.tolist()) < len(beyond)
+
+
+def test_a_guard_without_a_model_is_an_error(repository, tmp_path):
+    assert "--guard" in launch("--dropout", 0.5, "--guard", tmp_path, repository / "train.py", 1)
 
 
 @pytest.mark.slow
