@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -18,7 +18,7 @@ from benchmarks.paper.scenes import SCENES
 from benchmarks.setting import FEWEST, HELD_OUT, LATER, REFERENCES, Row, from_dense, references_of, rows_of
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
-__all__ = ["BY_DEFAULT", "CHOICES", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "tables"]
+__all__ = ["BY_DEFAULT", "CHOICES", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "pairs_of", "tables"]
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,19 @@ def gains_of(rows: Sequence[Row], choice: Choice) -> str:
     return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 
 
+def pairs_of(rows: Sequence[Row], names: Collection[str]) -> dict[str, list[tuple[float, float]]]:
+    """Return test PSNR of two settings with the dense start, by scene, of the seeds that both have."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    for scene in SCENES:
+        start = scene if scene == "synthetic" else from_dense(scene)  # which has points of its own
+        before, after = (rows_of(rows, start, name) for name in names)
+        if start == scene and "plain" in names:
+            before = references_of(rows, REFERENCES, scene)["plain"]
+        if shared := sorted(before.keys() & after.keys()):
+            found[scene] = [(value(before[seed], "test psnr"), value(after[seed], "test psnr")) for seed in shared]
+    return found
+
+
 def from_same_start(rows: Sequence[Row], titles: Mapping[str, str]) -> str:
     """Return a table of two settings with the dense start: test PSNR of the seeds that both have, and the gains.
 
@@ -95,19 +108,14 @@ def from_same_start(rows: Sequence[Row], titles: Mapping[str, str]) -> str:
         titles: of both, by the names of their rows.
     """
     lines, every, spreads = [], list[float](), list[float]()
-    for scene in SCENES:
-        start = scene if scene == "synthetic" else from_dense(scene)  # which has points of its own
-        before, after = (rows_of(rows, start, name) for name in titles)
-        if start == scene and "plain" in titles:
-            before = references_of(rows, REFERENCES, scene)["plain"]
-        if shared := sorted(before.keys() & after.keys()):
-            figures = [[value(of[seed], "test psnr") for seed in shared] for of in (before, after)]
-            gains = [y - x for x, y in zip(*figures, strict=True)]
-            every += gains
-            spreads += [mean_std(figures[1])[1]] if len(shared) > 1 else []
-            line = {"scene": scene, "seeds": str(len(shared))}
-            line |= {title: format_mean_std(of, decimals=2) for title, of in zip(titles.values(), figures, strict=True)}
-            lines.append(line | {"gain, by seed": ", ".join(f"{x:+.2f}" for x in gains)})
+    for scene, pairs in pairs_of(rows, titles.keys()).items():
+        figures = [*zip(*pairs, strict=True)]
+        gains = [after - before for before, after in pairs]
+        every += gains
+        spreads += [mean_std(figures[1])[1]] if len(pairs) > 1 else []
+        line = {"scene": scene, "seeds": str(len(pairs))}
+        line |= {title: format_mean_std(of, decimals=2) for title, of in zip(titles.values(), figures, strict=True)}
+        lines.append(line | {"gain, by seed": ", ".join(f"{x:+.2f}" for x in gains)})
     if not lines:
         return "Nothing was trained with both."
     total = [
