@@ -17,7 +17,7 @@ __all__ = ["TrainConfig", "saved_config"]
 class TrainConfig:
     """Settings of one training run. The defaults are those of the recipe ``3dgs``, but 3,000 iterations.
 
-    The steps at which something begins are those of the recipe's own 10,000: `with_recipe` scales them, as the commands do.
+    Steps at which something begins are those of the recipe's own 10,000; `with_recipe` scales them, as commands do.
 
     Raises:
         TypeError: if a number of steps, models, Gaussians or bands, or the seed, is no integer, or another number none.
