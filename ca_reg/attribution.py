@@ -102,6 +102,7 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor | Params, vie
     _, (result, opacity, multiplier, background) = _measure(score, opacity, view, "attribute")
     if result.reason is not Reason.OK:
         return CAAttribution(opacity.new_zeros(len(opacity), dtype=torch.float64), result)
+    # The score is the mean over the visible pixels: with these weights the shares add up to it.
     weights = result.visible.to(torch.float64) / result.visible.sum()
     with torch.no_grad():
         shares = shares_fn(opacity.clone(), view, multiplier, background, weights)
@@ -184,6 +185,7 @@ def total_effects(score: CAScore, opacity: Tensor | Params, view: Any) -> CATota
     if result.reason is not Reason.OK:
         return CATotalEffects(opacity.new_zeros(len(opacity), dtype=torch.float64), result)
     opacity = opacity.clone()
+    # One variance per Gaussian, also where the multiplier has one for all: each needs a gradient of its own.
     spread = (multiplier.variance * opacity.new_ones(opacity.shape[:1])).requires_grad_()
     gradient = None
     with torch.enable_grad():

@@ -114,6 +114,7 @@ class MLflowSink(Sink):
         elif np.ndim(x) == 3:
             self._client.log_image(self._run, x, f"images/{name}/{step:06d}.png")
         else:
+            # A histogram (N,) under a name that says what is left of it; a number keeps its own.
             name += " median" * np.ndim(x)
             self._client.log_metric(self._run, re.sub(r"[^\w\-. /]", "", name), float(np.median(x)), step=step)
 

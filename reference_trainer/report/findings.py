@@ -88,6 +88,7 @@ class Findings:
         means = gaussians.means - center
         scale = means.norm(dim=1).median().clamp_min(1e-9)
         columns = [
+            # Relative to the distance from the middle: most Gaussians are close to it, a few very far away.
             (means.sign() * (means / scale).abs().log1p(), 2e-4),
             (gaussians.log_scales, 0.02),
             (normalize(gaussians.quaternions, dim=1), 1 / 256),
@@ -159,6 +160,7 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Colle
         places = unseen_views(scene)
         places = [places[i].to(device) for i in evenly_spaced(len(places), min(MOST_UNSEEN, len(places)))]
         unseen = [(place, errors(place)) for place in places]
+        # The Gaussians of models trained without a regularizer need each other.
         hangs = guard(model, scene, places) if len(model.chain) else None
     else:
         notes.append(f"{label}: no views that you did not take, because none lies between or beyond a single camera.")

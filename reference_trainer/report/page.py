@@ -260,6 +260,7 @@ def _strategies(
             for other in map(read_results, sorted(path.parent for path in run.parent.glob(f"seed_*/{RESULTS}"))):
                 of.setdefault(other["config"]["seed"], other)
         key: object = label if run in whole else (scene, dataclasses.replace(config, seed=0))
+        # The same settings and seed again, perhaps from another machine: kept apart, or one would hide the other.
         if key in found and config.seed in found[key][1]:
             key = label
         if of:
@@ -309,6 +310,7 @@ def _curves(runs: dict[str, Path]) -> tuple[list[dict[str, Any]], list[str]]:
                 curve: dict[str, Any] = {"run": label, "group": group, "step": columns["step"].tolist()}
                 for name, unit in (("ca", 1e-3), ("psnr", 1.0)):
                     values = columns.get(f"{name}/{group}", np.full(len(columns["step"]), np.nan)) / unit
+                    # None, as JSON has no nan.
                     curve[name] = [round(x, 4) if np.isfinite(x) else None for x in values.tolist()]
                 curves.append(curve)
     return curves, missing
@@ -339,6 +341,7 @@ def _views(found: Sequence[Findings]) -> list[dict[str, Any]]:
         for split, group in each.views.items():
             for view in group:
                 entry = _entry(view, view_name(split, view.name), len(found))
+                # By pose as well: views between and around the cameras only have numbers, and another split moves them.
                 entry = views.setdefault((split, view.name, str(entry["pose"])), entry)
                 entry["pictures"][number] = next(pictures)
     return list(views.values())
@@ -376,6 +379,8 @@ def _unseen(found: Sequence[Findings]) -> list[dict[str, Any]]:
         entries.append(_entry(view, view.name, len(found)))
         for number, each in enumerate(found):
             for other, expected in each.unseen:
+                # By pose, as runs that were trained on different photographs may have
+                # other cameras under the same name.
                 if torch.equal(other.camera.world_to_camera, view.camera.world_to_camera):
                     entries[-1]["pictures"][number] = pictures_of(each.model, other, expected)
     return entries

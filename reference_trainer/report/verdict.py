@@ -55,6 +55,7 @@ def natural_order(config: TrainConfig) -> tuple[int, bool]:
     kinds = set(re.sub(r"\([^)]*\)", "", config.regularizers).replace("+", " ").split())
     order = [set(), {"dropout"}, {"noise"}, {"dropout", "noise"}, kinds]
     other = (config.loss, config.density) != (_USUAL.loss, _USUAL.density)
+    # `kinds` itself closes the list: any other combination gets its index.
     return 4 if other else order.index(kinds), config.analytic
 
 
@@ -109,6 +110,7 @@ def _difference(rows: Rows, reference: Rows, split: str, key: str) -> tuple[floa
     if not values or not others:
         return None
     (mean, std), (other, spread) = mean_std(values), mean_std(others)
+    # Variances of independent means add up. With one seed the standard deviation, and so the margin, is nan.
     return mean - other, 2 * math.sqrt(std**2 / len(values) + spread**2 / len(others))
 
 
@@ -152,6 +154,7 @@ def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:
         means = [of.mean(split, key) / unit for of in strategies]
         if (split and split not in unseen) or all(map(math.isnan, means)):
             continue
+        # Compared as they are shown: two figures that read the same must not be ranked.
         rounded = [round(mean, decimals) for mean in means]
         known = [mean for mean in rounded if not math.isnan(mean)]
         best = None if highest is None or len(known) < 2 else max(known) if highest else min(known)

@@ -103,6 +103,7 @@ def _remove_other_pictures(folder: Path, views: Mapping[str, Sequence[Viewpoint]
     """Remove the pictures of an earlier measurement at other views, which have no scores beside them."""
     named = {split: file_names([view.name for view in group]) for split, group in views.items()}
     shown = {folder / split / f"{name}{end}.png" for split, of in named.items() for name in of for end in ("", PANEL)}
+    # Only pictures that this package has written: the folder is the user's.
     for path in {*folder.glob("*/*.png")} - shown:
         if is_own_png(path):
             path.unlink()
