@@ -119,12 +119,12 @@ def hanging(
 ) -> Tensor:
     """Find the Gaussians that hang where no photograph was taken: veils and blobs before and beside the cameras.
 
-    Training with dropout can leave opaque Gaussians where no training camera looks, and no photograph tells. A Gaussian
-    is suspect if its weight at cameras that nobody took is more than ``ratio`` times that at the training cameras. If
-    all suspects hold less than ``together`` of the score there, nothing hangs: that is what a training leaves beside
-    its pictures. Else those hang that hold more than ``alone``. Remove them, measure again, and stop when none is
-    found. It is for models that were trained with dropout or noise: the Gaussians of others need each other. Which
-    cameras, which numbers and what it gained: benchmarks/guard.md.
+    Training with dropout can leave opaque Gaussians where no training camera looks, so that no photograph shows them. A
+    Gaussian is suspect if its weight at cameras that nobody took exceeds ``ratio`` times its weight at the training
+    cameras. If all suspects together hold at most the share ``together`` of the score there, nothing hangs: every
+    training leaves as much beside its pictures. Otherwise each suspect that holds more than ``alone`` hangs. Remove
+    these, measure again, and stop when none is found. Use it for models that were trained with dropout or noise: in
+    others, Gaussians need each other. For the cameras, the numbers and the gain, see benchmarks/guard.md.
 
     Args:
         shares: from :func:`attribute`, averaged over cameras that nobody took, at least 0, shape (N,).

@@ -38,9 +38,9 @@ _NORMAL_80 = 1.2816  # 80 % of a normal distribution lie within so many standard
 class Form(NamedTuple):
     """A sum of features that was fitted as a whole.
 
-    ``weights`` are in units of color; a product of two features counts one where the other is 1. ``peaked`` is the mean
-    squared error of a view over the mean square of the expectation, ``spread`` the root mean square, dB, of what the
-    measured PSNR differs by from the expected one in scenes that had no part in the fit.
+    ``weights`` are in units of color; a product of two features counts one where the other is 1. ``peaked`` is the
+    ratio of a view's mean squared error to the mean square of its expected error. ``spread`` is the root mean square
+    difference of measured and expected PSNR, dB, on scenes left out of the fit.
     """
 
     weights: Mapping[str, float]
@@ -62,8 +62,10 @@ FORMS = (
 """From the form that needs most to the one that needs an image and its alpha alone."""
 
 TRANSFER = 0.87
-"""Mean error of a view over what the photographs, each predicted from the others, let expect: :func:`expected_error`'s
-``unit`` is a quotient of such differences times this."""
+"""Ratio of a view's mean error to the error that is predicted for it by leaving out each photograph in turn.
+
+That prediction compares, at the photographs, measured with expected differences: their ratio times this is the ``unit``
+of :func:`expected_error`."""
 
 
 class ErrorMap(NamedTuple):

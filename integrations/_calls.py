@@ -34,7 +34,7 @@ def chain_of(regularizer: nn.Module) -> Chain:
 
 
 class Signature:
-    """Binds the arguments of calls of one function, where all have names in a tenth of the time that inspect takes."""
+    """Binds the arguments of calls of one function; if all have names, in a tenth of the time that inspect takes."""
 
     def __init__(self, full: inspect.Signature) -> None:
         self.full = full
@@ -353,7 +353,7 @@ class CallSite(NamedTuple):
 
 
 def second_regularizers(chain: Chain) -> dict[str, str]:
-    """Return the variables by which the paper's code does what a chain does, and what that is called here."""
+    """Return the variables with which the paper's code does what a chain does, each with the class for it here."""
     perturbs = any(isinstance(member, OpacityNoise) for member in chain)
     names = {"dropout_factor": "GaussianDropout"} if chain.drops else {}
     return names | ({"sigma_noise": "OpacityNoise"} if perturbs else {})

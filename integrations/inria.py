@@ -297,9 +297,9 @@ class RasterizerHook(Hook):
     def _refuse_to_train_on_a_viewer(self, gradient: Tensor) -> None:
         """Raise: a gradient arrived from a render taken for a viewer's."""
         raise RuntimeError(
-            f"a render for a viewer is trained on: its camera is a {self._viewer}, which the hook takes for that of a "
-            "viewer, so that it was scaled and not regularized. If the training views are of this class, say that "
-            "there is no viewer: viewer=None, in the launcher --viewer none."
+            f"a training step used a render that was taken for a viewer's, because its camera is a {self._viewer}: its "
+            "opacities were scaled, not regularized. If the training cameras are of this class, say that there is no "
+            "viewer: viewer=None, in the launcher --viewer none."
         )
 
 

@@ -32,9 +32,9 @@ _TINY = 1e-4  # alpha, below which a pixel has no color of its own
 class ErrorMaps:
     """Expect the error of views without a photograph; what the views of a model share is computed once.
 
-    Which pixels are worse than others, the weights tell that were fitted on other scenes. How large errors are in this
-    scene, its photographs tell: each training photograph is predicted from the others, brought into it by the model's
-    depth, and what they differ by, over what the sum of features expects there, is the unit of the maps.
+    Weights fitted on other scenes rank the pixels; this scene's photographs set the scale. Each training photograph is
+    predicted from the others, which are warped into it by the model's depth. The unit of the maps follows from the
+    ratio of the measured difference to the one that the sum of features expects there.
 
     For each training view this takes what a map takes, and a render; for each view two renders, a pass of moments, and
     the warps.

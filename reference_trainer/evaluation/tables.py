@@ -230,7 +230,14 @@ def print_table(markdown: str) -> None:
 
 @dataclass(frozen=True)
 class _Column:
-    """A column: its cells, the title first; whether they are figures, to the right; the bold ones; if all are whole."""
+    """A column of a table in the terminal.
+
+    Args:
+        cells: its texts, the title first.
+        figures: whether they are figures, which are aligned to the right.
+        bold: positions of the cells in bold.
+        whole: whether no cell but the title may be broken into lines.
+    """
 
     cells: Sequence[str]
     figures: bool

@@ -153,7 +153,7 @@ class Gaussians:
 def positions(index: Tensor) -> Tensor:
     """Return the positions where a mask is set; positions as they are.
 
-    For several tensors that one mask selects from: a card makes the host wait for every mask, to know the size.
+    Use it where one mask selects from several tensors: each selection by a mask makes the host wait for a card.
 
     Example:
         >>> positions(torch.tensor([True, False, True]))

@@ -362,9 +362,9 @@ def _entry(view: Viewpoint, name: str, runs: int) -> dict[str, Any]:
 
 
 def _unseen(found: Sequence[Findings]) -> list[dict[str, Any]]:
-    """Return the views that nobody took of which least is expected, of any run, the worst first.
+    """Return the views that nobody took with the lowest expected PSNR in any run, the worst first.
 
-    Of the cameras of one way, between the same two or beyond the same one, only the worst: the others look like it.
+    Cameras between the same two, or beyond the same one, look alike: only the worst of them is kept.
     """
     least: dict[str, tuple[float, Viewpoint]] = {}
     for view, expected in (one for each in found for one in each.unseen):

@@ -219,7 +219,7 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
 
 
 def _said(rows: Rows, reference: Rows, split: str) -> tuple[str, str]:
-    """Return how a strategy differs from the reference in PSNR and co-adaptation, and what leads to the latter's name.
+    """Return how a strategy differs from the reference in PSNR and co-adaptation, and the word before its name.
 
     Both are empty if the two share no score.
     """

@@ -84,8 +84,8 @@ class Monitoring:
     def __post_init__(self) -> None:
         if self.every < 0 or self.checkpoint_every < 1:
             raise ValueError(
-                f"expected monitor_every of at least 0, for no measurements, and checkpoint_every of at least 1, got "
-                f"{self.every} and {self.checkpoint_every}."
+                f"monitor_every must be at least 0 (0: never) and checkpoint_every at least 1, got {self.every} and "
+                f"{self.checkpoint_every}."
             )
 
 
