@@ -21,8 +21,8 @@ class RenderMoments:
 
     The memory is two images, plus an image and a map per group, however many renders are added. The first render is
     subtracted from all: what they have in common, which would drown their variance in E[x^2] - E[x]^2, is gone before
-    anything is squared. The variance is off by usually a few roundings, by at most about K^2 where the first render
-    alone differs from the K - 1 others.
+    anything is squared. The variance is usually off by a few roundings; by up to about K^2 of them where the first
+    render alone differs from the K - 1 others.
 
     Args:
         groups: number of groups; each pools every ``groups``-th render.
@@ -200,7 +200,7 @@ def _mean_or_reason(pixels: float, total: float, broken: bool, excess: float) ->
 
 
 def _highest(alpha: Tensor) -> Tensor:
-    """Return the largest alpha, 0 of none."""
+    """Return the largest alpha; 0 if there is none."""
     return alpha.amax() if alpha.numel() else alpha.sum()
 
 

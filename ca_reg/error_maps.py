@@ -84,16 +84,16 @@ class ErrorMap(NamedTuple):
 
 
 def expected_error(features: Mapping[str, Tensor], mask: Tensor | None = None, *, unit: float = 1.0) -> ErrorMap:
-    """Return the error that the features of a view let expect: a sum of them, smoothed.
+    """Return the expected error of a view from its features: a weighted sum of them, smoothed.
 
-    The most demanding of `FORMS` whose features are all there is used. The features, of shape (H, W):
+    The sum is the most demanding of `FORMS` whose features are all given. The features, of shape (H, W):
 
     - ``empty``: 1 - alpha;
     - ``contrast``: length of the gradient of the image's mean over RGB, per pixel;
     - ``deviation``: root of the exact variance of the color, mean over RGB, under dropout at the training rate;
     - ``colors``: root of :func:`ca_reg.functional.color_variance`: surfaces along the ray that disagree;
-    - ``hidden``: 1 where no training photograph can be brought by the model's depth, else 0;
-    - ``warp``: least absolute difference, mean over RGB, to the photographs that can be, 0 where none can.
+    - ``hidden``: 1 where no training photograph, warped into the view by the model's depth, shows the pixel, else 0;
+    - ``warp``: least absolute difference, mean over RGB, to the photographs that show it, 0 where none does.
 
     Args:
         features: by name.
@@ -181,7 +181,7 @@ def error_map(
     features = {"empty": (1 - alpha).clamp_min(0), "contrast": contrast(image)}
     if isinstance(moments_fn, ListMoments):
         features["colors"] = moments_fn.color_variance(expected, view).sqrt()
-        layout = "CHW"  # of its moments, whatever that of the renderer
+        layout = "CHW"  # of its moments, whatever the layout of the renderer
     if moments_fn is not None:
         moments = moments_fn(opacity.detach().clone(), view, Multiplier.dropout(p or PLAIN_RATE), None)
         features["deviation"] = read_moments(moments, layout=layout).variance.mean(0).clamp_min(0).sqrt()

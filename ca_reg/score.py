@@ -252,7 +252,7 @@ class CAScore:
         return x._replace(opacities=x.opacities.detach(), step=self.regularizer.step if x.step is None else x.step)
 
     def update(self, opacity: Tensor | Params, view: Any, *, index: int | None = None) -> CAResult:
-        """Measure one view and count it in the mean that :meth:`compute` returns; arguments and errors are a call's.
+        """Measure one view and count it in the mean that :meth:`compute` returns; arguments and errors as for a call.
 
         Views are counted from the last reset, and over ranks as :class:`torch.utils.data.DistributedSampler` deals them
         out without shuffling, which gives the result of a single process. If they are split in another way, ``index``
@@ -392,7 +392,7 @@ class _AdaptiveScore(CAScore):
     def _measure(self, x: Params, view: Any, index: int) -> CAResult:
         """Render until the error is small enough.
 
-        The region must not come from the sampled renders: pixels that they all happen to cover happen to vary little.
+        The region must not come from the sampled renders: pixels that all of them happen to cover tend to vary little.
         """
         settings = self.settings
         assert settings.max_samples is not None

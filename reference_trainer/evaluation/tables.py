@@ -66,7 +66,7 @@ QUANTITIES = {
 """By name, in the order of the columns."""
 
 _NOT_EVERYWHERE = re.compile("psnr|ssim|lpips|depth")
-"""How the names of quantities begin that need a photograph, a view that was not trained on, weights or a true depth."""
+"""Beginnings of the quantities that need a photograph, a view that was not trained on, weights or a true depth."""
 _HIGHEST_IS_BEST = {"PSNR (dB)": True, "SSIM": True, "LPIPS": False, EXACT: False, "depth AbsRel": False}
 
 

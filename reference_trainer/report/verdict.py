@@ -115,7 +115,7 @@ def _difference(rows: Rows, reference: Rows, split: str, key: str) -> tuple[floa
 
 
 def differences(first: Rows, second: Rows) -> list[dict[str, object]]:
-    """Return a row for every score that both have: of each, the difference, and whether seeds tell them apart.
+    """Return a row for every score that both have: both scores, the difference, and whether seeds tell them apart.
 
     The difference is that of the means, with two of its standard errors. Below `FEWEST_SEEDS` of either, the spread is
     not known well enough to tell anything apart.

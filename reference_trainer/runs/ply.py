@@ -233,7 +233,7 @@ def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
 
 
 def log_other_frame(result: Evaluation, scene: Scene, ply: Path) -> None:
-    """Log it if a model fits no training view as well as the mean color of the pixels of its photograph that count."""
+    """Log it if at every training view one color, the mean of the pixels that count, fits better than the model."""
 
     def of_mean(view: View) -> float:
         pixels = counted(view.image, view.mask)[:, None]

@@ -292,7 +292,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             self._status.content = f"path: {cameras}; a flight needs 2 or more, 2 s from each to the next"
 
     def _hide_nearest_frustum(self, position: Any, *, beside: bool) -> None:
-        """Hide the frustum that a page looks out of, which would lie across its picture, and all beside each other."""
+        """Hide the frustum that a page looks out of, which would lie across its picture; all of them if ``beside``."""
         for place, frustum in self._frusta:
             visible = not beside and float(np.linalg.norm(place - np.asarray(position))) > 2 * frustum.scale
             if frustum.visible != visible:
@@ -385,10 +385,10 @@ def _pose(camera: Camera, distance: float, level: torch.Tensor | None = None) ->
 
 
 def _level(cameras: Sequence[Camera]) -> torch.Tensor:
-    """Return the direction (3,) that is up if cameras were held level: across their x axes, near their mean."""
+    """Return the direction (3,) that is up if cameras were held level: perpendicular to their x axes."""
     axes = torch.stack([camera.world_to_camera[:3, :3] for camera in cameras])
     right, up = axes[:, 0], -axes[:, 1].mean(0)
-    weak = 0.01 * len(cameras)  # of the mean, which decides what parallel axes leave open
+    weak = 0.01 * len(cameras)  # of the mean direction that is up, which decides where parallel axes leave it open
     return torch.nn.functional.normalize(torch.linalg.solve(right.T @ right + weak * torch.eye(3), weak * up), dim=0)
 
 
