@@ -85,7 +85,7 @@ def _by_leaves(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     low, high = places.amin(1), places.amax(1)
 
     def gaps(rows: Tensor) -> Tensor:
-        """Return the squared distances of these boxes to all, (rows, leaves); below 0 to itself if its points coincide."""
+        """Return the squared distances of these boxes to all, (rows, leaves); below 0 to itself if points coincide."""
         found = torch.maximum(low[rows, None] - high, low - high[rows, None]).clamp_min_(0).square_().sum(-1)
         found[every[: len(rows)], rows] -= (reach[rows] == 0).to(found)
         return found

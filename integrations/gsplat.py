@@ -176,8 +176,8 @@ class Regularized:
             per_camera = keep.unsqueeze(-2)  # [..., 1, N]
             info["radii"] = radii * (per_camera if radii.ndim == per_camera.ndim else per_camera.unsqueeze(-1))
         elif self._missed < _EVIDENCE:
-            # Whether they are listed depends on gsplat's version alone. The check synchronizes a GPU, so it ends once so
-            # many Gaussians have been dropped that some would have been listed; a draw that drops none tells nothing.
+            # Whether they are listed depends on gsplat's version alone. The check synchronizes a GPU, so it ends once
+            # enough Gaussians were dropped for some to have been listed; a draw that drops none tells nothing.
             batches = info.get("batch_ids")
             listed = (gaussians if batches is None else batches * keep.shape[-1] + gaussians).long()
             kept, share = int(keep.reshape(-1)[listed].sum()), float(keep.float().mean())

@@ -59,9 +59,9 @@ __all__ = ["compare_two", "labels", "view_name", "write_report"]
 _log = logging.getLogger(__name__)
 
 VIEWS = 8
-"""Of each split, unless others are asked for."""
+"""Of each split, unless another number is asked for."""
 EACH = 3
-"""Views that nobody took, at most, of those between the training cameras and of those beyond."""
+"""Views that nobody took, at most, between the training cameras, and as many beyond them."""
 
 
 def write_report(
@@ -76,11 +76,11 @@ def write_report(
 
     It begins with a verdict and its evidence, and shows the scores with their differences to the first run, CA and PSNR
     against the step, every model in 3D (all turn together) in its colors or its co-adaptation heat, any two of
-    photograph, render, error, expected error and CA map of all runs upon each other, the views that nobody took of
-    which least is expected, what hangs there, and how concentrated the score is on few Gaussians. Runs come in the
-    order baseline, dropout, noise, both, under natural names. The heat is the share of the exact score at drop rate 1/2
-    per blend weight, over the views of the page, on one logarithmic scale for all runs around the mean of the first run
-    that has one. What a run lacks is left out, and the page says so.
+    photograph, render, error, expected error and CA map of all runs on top of each other, the views that nobody took
+    with the lowest expected PSNR, what hangs there, and how concentrated the score is on few Gaussians. Runs come in
+    the order baseline, dropout, noise, both, under natural names. The heat is the share of the exact score at drop rate
+    1/2 per blend weight, over the views of the page, on one logarithmic scale for all runs around the mean of the first
+    run that has one. What a run lacks is left out, and the page says so.
 
     Args:
         runs: their folders, finished or not; the folder of a comparison stands for the first seed of each strategy, and

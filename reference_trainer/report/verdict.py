@@ -144,8 +144,8 @@ def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:
     """Return the columns of the scores: ``split``, ``title``, ``cells`` of ``text``, ``best``, ``delta``, ``better``.
 
     ``delta`` is the difference to the first strategy as text, ``better`` whether that is an improvement (None where
-    neither direction is one). The best figure of a column that has a best is marked, all that share it. Below what is
-    expected stands the ``interval`` of a view, the mean of its ends.
+    neither direction is one). In a column that has a best figure, it is marked, and so are all that share it. A cell of
+    the expected PSNR also has the ``interval`` of a view: the means of its two ends.
     """
     columns = []
     unseen = {split for of in strategies for run in of.results for split in run["mean"]}

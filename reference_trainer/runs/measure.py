@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 def load_run_model(
     run: Path, device: str = "cpu", *, regularizer: str | None = None, trust: Collection[str] = ()
 ) -> tuple[TrainedModel, Scene]:
-    """Return a run's model at its last checkpoint, and its scene; logs where that is if the training is not finished.
+    """Return a run's model at its last checkpoint, and its scene; logs its step if the training is not finished.
 
     With ``regularizer``, such as "noise(0.8, scale=True)" for a run with "noise(0.8)", the model is treated as if it
     had been trained with that. ``trust`` is as for `load_run`.

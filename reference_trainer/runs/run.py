@@ -65,7 +65,7 @@ class Monitoring:
     """What is measured and saved while a model trains; it does not affect what is trained.
 
     Args:
-        every: steps between measurements of CA and PSNR, which also takes place after the last step; 0 for none.
+        every: steps between measurements of CA and PSNR, which also take place after the last step; 0 for none.
         protocol: whether to log the paper's CA of five renders in the place of the exact score of all tables.
         pictures: whether each measurement also logs the ``details`` of `CAMonitor` (see `training_snapshot`).
         checkpoint_every: steps between checkpoints, the most that a dead worker costs.

@@ -44,7 +44,7 @@ FEWEST, MOST = 10_000, 1_000_000
 TRAINING_SHARE = 0.1
 """Fraction of a training's time that showing its new states may take; moving the camera takes more."""
 MOVIE_PIXELS, MOVIE_FRAMES = 400_000, 40
-"""Of a recorded flight: most pixels of a picture of a model, and pictures from one camera to the next."""
+"""Of a recorded flight: most pixels of a model's picture, and the number of pictures from one camera to the next."""
 BOTH = "side by side"
 
 
@@ -111,7 +111,10 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             self._server.stop()
 
     def show(self, model: TrainedModel, views: Mapping[str, Sequence[Viewpoint]], name: str = "") -> None:
-        """Show a model from now on; one of another name beside the first, whose views are the cameras to jump to."""
+        """Show a model from now on.
+
+        A model of another name is shown beside the first, whose views remain the cameras to jump to.
+        """
         device = model.gaussians.means.device
         flat = [view.to(device) for group in views.values() for view in group]
         train = [view for view in views.get("train", ()) if isinstance(view, View)]  # test views must not tell
@@ -149,7 +152,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             self._next_model = end + (end - start) * (1 / TRAINING_SHARE - 1)
 
     def update(self) -> float | None:
-        """Render for every page that is due; return the seconds until the next one is, None if that takes a change."""
+        """Render for every page that is due; return the seconds until the next is, None if only a change makes one due."""
         waits = []
         for window in list(self._windows.values()):
             still = time.monotonic() - window.moved
