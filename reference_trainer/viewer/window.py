@@ -152,7 +152,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             self._next_model = end + (end - start) * (1 / TRAINING_SHARE - 1)
 
     def update(self) -> float | None:
-        """Render for every page that is due; return the seconds until the next is, None if only a change makes one due."""
+        """Render for every page that is due; return the seconds until the next is, None if that takes a change."""
         waits = []
         for window in list(self._windows.values()):
             still = time.monotonic() - window.moved
