@@ -207,6 +207,7 @@ class Plan:
 
     def check(self) -> None:
         check_scenes([_chosen(self.scene, self.folder).path])
+        # An earlier plan, known by its entry for the items, may be overwritten, and no other file.
         if self.out is not None and self.out.exists() and '"items"' not in self.out.read_text("utf-8", "ignore"):
             raise ValueError(f"{self.out} is no plan of ca-reg and is not overwritten: give another --out.")
 
@@ -317,6 +318,7 @@ class Compare:
         trust = set[str]().union(*map(modules_named, (self.scene, *chosen.values())))  # named on this command line
         # The pages are written here, where the machines of a cluster may have cards and this one none.
         here = self.device if not self.elsewhere else "cpu"
+        # Where every run failed there is nothing to show.
         for folder in [folder for folder, comparison in comparisons.items() if comparison.runs]:
             write_report([folder], device=here, trust=trust)
         if any(comparison.failures for comparison in comparisons.values()):

@@ -160,7 +160,6 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Colle
         places = unseen_views(scene)
         places = [places[i].to(device) for i in evenly_spaced(len(places), min(MOST_UNSEEN, len(places)))]
         unseen = [(place, errors(place)) for place in places]
-        # The Gaussians of models trained without a regularizer need each other.
         hangs = guard(model, scene, places) if len(model.chain) else None
     else:
         notes.append(f"{label}: no views that you did not take, because none lies between or beyond a single camera.")

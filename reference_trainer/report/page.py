@@ -114,6 +114,7 @@ def write_report(
                 f"{found[0].scene.name} and {run} on {found[-1].scene.name}: write a report for each."
             )
     data = _data(dict(zip(names, runs, strict=True)), found, whole=set(runs) - set(folders))
+    # The page names the command that makes it again, without what is usual.
     command = ["ca-reg", "report", *map(str, folders)]
     command += ["--views", str(views)] * (views != VIEWS) + ["--trust", *sorted(trust)] * bool(trust)
     data["made"] = f"{shlex.join(command)} · ca_reg {ca_reg.__version__} · {datetime.now():%Y-%m-%d %H:%M}"
@@ -154,6 +155,7 @@ def compare_two(first: Path, second: Path) -> tuple[list[dict[str, object]], lis
     if len(configs) < 2:
         raise ValueError(f"expected two different runs, got {first} twice.")
     viewed = [{(runs[0]["scene"], view["split"], view["name"]) for view in runs[0]["views"]} for runs in both]
+    # A split whose views differ is left out as a whole: a mean over other views is another quantity.
     other = {split for _, split, _ in viewed[0] ^ viewed[1]}
     shared = {split for _, split, _ in viewed[0] & viewed[1]} - other
     if not shared:

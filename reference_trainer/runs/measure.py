@@ -73,6 +73,7 @@ def measure(
     Raises:
         ValueError: if ``out`` holds files of these names that are not from here.
     """
+    # A folder with an earlier measurement is ours; in any other, files of these names are somebody else's.
     if not ((out / EVALUATION).exists() or (out / PARTIAL).exists()):
         check_output(out, None, ("evaluation.md", VIEWS))
     partial = out / PARTIAL
