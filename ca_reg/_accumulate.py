@@ -21,8 +21,8 @@ class RenderMoments:
 
     The memory is two images, plus an image and a map per group, however many renders are added. The first render is
     subtracted from all: what they have in common, which would drown their variance in E[x^2] - E[x]^2, is gone before
-    anything is squared. The variance is off by usually a few roundings, by at most about K^2 where the first render
-    alone differs from the K - 1 others.
+    anything is squared. The variance is usually off by a few roundings; by up to about K^2 of them where the first
+    render alone differs from the K - 1 others.
 
     Args:
         groups: number of groups; each pools every ``groups``-th render.
@@ -153,10 +153,10 @@ def effect_of(value: float, differ: list[Tensor]) -> Reason:
 def exact_mean(
     moments: ExactMoments, alpha: Tensor, threshold: float, broken: bool
 ) -> tuple[Tensor, Tensor, float, Reason]:
-    """Return variance (H, W), visible pixels, and the mean over them or why there is none, of exact moments.
+    """Return, for exact moments, the variance (H, W), the visible pixels, the mean over these, and the reason.
 
-    ``alpha`` is the expected one; ``broken`` as for `visible_mean`. A GPU is waited for once, unless something is not
-    finite. Raises what `finite_colors` does.
+    The mean is nan if the reason is not OK. ``alpha`` is the expected one; ``broken`` as for `visible_mean`. The host
+    waits for a GPU once, unless something is not finite. Raises what `finite_colors` does.
     """
     mean, variance, _ = moments
     visible, spread = alpha > threshold, variance.mean(0).to(torch.float64)
@@ -176,7 +176,7 @@ def exact_mean(
 def visible_mean(variance: Tensor, visible: Tensor, broken: bool, excess: float) -> tuple[float, Reason]:
     """Average over the visible pixels, or say why not; ``broken`` is what `finite_colors` found.
 
-    ``excess`` is the divisor of a population variance over that of this one.
+    ``excess`` is count / (count - ddof): the ratio of this variance to that of the population.
     """
     pixels, total = torch.stack(_visible_sums(variance, visible)).tolist()
     return _mean_or_reason(pixels, total, broken, excess)
@@ -200,7 +200,7 @@ def _mean_or_reason(pixels: float, total: float, broken: bool, excess: float) ->
 
 
 def _highest(alpha: Tensor) -> Tensor:
-    """Return the largest alpha, 0 of none."""
+    """Return the largest alpha; 0 if there is none."""
     return alpha.amax() if alpha.numel() else alpha.sum()
 
 

@@ -35,7 +35,7 @@ def draw_numbers(
             "state and no other, so the gradient would be that of another draw. Draw outside the checkpointed function "
             "and give it drawn=, or leave out generator."
         )
-    if generator is None:  # and unnamed: a compiled graph could not draw for a number of Gaussians that changes
+    if generator is None:  # not passed on: with it, a compiled graph could not draw for a number that changes
         return sample(n, dtype=torch.float32, device=device)
     if isinstance(generator, PortableGenerator):
         return generator.numbers(sample, n, device)
@@ -60,7 +60,7 @@ class PortableGenerator(torch.Generator):
     """
 
     def __new__(cls, *entropy: int) -> PortableGenerator:
-        return super().__new__(cls)  # on the CPU; of the integers it would make a device
+        return super().__new__(cls)  # without the integers, which torch would take for a device; on the CPU
 
     def __init__(self, *entropy: int) -> None:
         self._seed = _word(entropy)

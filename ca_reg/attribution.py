@@ -102,6 +102,7 @@ def attribute(score: CAScore, shares_fn: SharesFn, opacity: Tensor | Params, vie
     _, (result, opacity, multiplier, background) = _measure(score, opacity, view, "attribute")
     if result.reason is not Reason.OK:
         return CAAttribution(opacity.new_zeros(len(opacity), dtype=torch.float64), result)
+    # The score is the mean over the visible pixels: with these weights the shares add up to it.
     weights = result.visible.to(torch.float64) / result.visible.sum()
     with torch.no_grad():
         shares = shares_fn(opacity.clone(), view, multiplier, background, weights)
@@ -118,12 +119,12 @@ def hanging(
 ) -> Tensor:
     """Find the Gaussians that hang where no photograph was taken: veils and blobs before and beside the cameras.
 
-    Training with dropout can leave opaque Gaussians where no training camera looks, and no photograph tells. A Gaussian
-    is suspect if its weight at cameras that nobody took is more than ``ratio`` times that at the training cameras. If
-    all suspects hold less than ``together`` of the score there, nothing hangs: that is what a training leaves beside
-    its pictures. Else those hang that hold more than ``alone``. Remove them, measure again, and stop when none is
-    found. It is for models that were trained with dropout or noise: the Gaussians of others need each other. Which
-    cameras, which numbers and what it gained: benchmarks/guard.md.
+    Training with dropout can leave opaque Gaussians where no training camera looks, so that no photograph shows them. A
+    Gaussian is suspect if its weight at cameras that nobody took exceeds ``ratio`` times its weight at the training
+    cameras. If all suspects together hold at most the share ``together`` of the score there, nothing hangs: every
+    training leaves as much beside its pictures. Otherwise each suspect that holds more than ``alone`` hangs. Remove
+    these, measure again, and stop when none is found. Use it for models that were trained with dropout or noise: in
+    others, Gaussians need each other. For the cameras, the numbers and the gain, see benchmarks/guard.md.
 
     Args:
         shares: from :func:`attribute`, averaged over cameras that nobody took, at least 0, shape (N,).
@@ -184,6 +185,7 @@ def total_effects(score: CAScore, opacity: Tensor | Params, view: Any) -> CATota
     if result.reason is not Reason.OK:
         return CATotalEffects(opacity.new_zeros(len(opacity), dtype=torch.float64), result)
     opacity = opacity.clone()
+    # One variance per Gaussian, also where the multiplier has one for all: each needs a gradient of its own.
     spread = (multiplier.variance * opacity.new_ones(opacity.shape[:1])).requires_grad_()
     gradient = None
     with torch.enable_grad():

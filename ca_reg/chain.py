@@ -85,8 +85,8 @@ class Chain(Regularizer):
             member.set_step(step)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        # The chain and its members of constant rate save no step; at one that was set before, later than the saved one,
-        # they would keep the others from going back.
+        # The chain and its members of constant rate save no step. If they stayed at a later one that was set before,
+        # the step of the whole, which is the latest of all, would not go back to the saved one.
         scheduled = [name for name, part in self.named_modules() if isinstance(part, Scheduled)]
         saved = [state_dict[key] for name in scheduled if (key := f"{prefix}{name}.step") in state_dict]
         if saved:

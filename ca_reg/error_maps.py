@@ -38,9 +38,9 @@ _NORMAL_80 = 1.2816  # 80 % of a normal distribution lie within so many standard
 class Form(NamedTuple):
     """A sum of features that was fitted as a whole.
 
-    ``weights`` are in units of color; a product of two features counts one where the other is 1. ``peaked`` is the mean
-    squared error of a view over the mean square of the expectation, ``spread`` the root mean square, dB, of what the
-    measured PSNR differs by from the expected one in scenes that had no part in the fit.
+    ``weights`` are in units of color; a product of two features counts one where the other is 1. ``peaked`` is the
+    ratio of a view's mean squared error to the mean square of its expected error. ``spread`` is the root mean square
+    difference of measured and expected PSNR, dB, on scenes left out of the fit.
     """
 
     weights: Mapping[str, float]
@@ -62,8 +62,10 @@ FORMS = (
 """From the form that needs most to the one that needs an image and its alpha alone."""
 
 TRANSFER = 0.87
-"""Mean error of a view over what the photographs, each predicted from the others, let expect: :func:`expected_error`'s
-``unit`` is a quotient of such differences times this."""
+"""Ratio of a view's mean error to the error that is predicted for it by leaving out each photograph in turn.
+
+That prediction compares, at the photographs, measured with expected differences: their ratio times this is the ``unit``
+of :func:`expected_error`."""
 
 
 class ErrorMap(NamedTuple):
@@ -82,16 +84,16 @@ class ErrorMap(NamedTuple):
 
 
 def expected_error(features: Mapping[str, Tensor], mask: Tensor | None = None, *, unit: float = 1.0) -> ErrorMap:
-    """Return the error that the features of a view let expect: a sum of them, smoothed.
+    """Return the expected error of a view from its features: a weighted sum of them, smoothed.
 
-    The most demanding of `FORMS` whose features are all there is used. The features, of shape (H, W):
+    The sum is the most demanding of `FORMS` whose features are all given. The features, of shape (H, W):
 
     - ``empty``: 1 - alpha;
     - ``contrast``: length of the gradient of the image's mean over RGB, per pixel;
     - ``deviation``: root of the exact variance of the color, mean over RGB, under dropout at the training rate;
     - ``colors``: root of :func:`ca_reg.functional.color_variance`: surfaces along the ray that disagree;
-    - ``hidden``: 1 where no training photograph can be brought by the model's depth, else 0;
-    - ``warp``: least absolute difference, mean over RGB, to the photographs that can be, 0 where none can.
+    - ``hidden``: 1 where no training photograph, warped into the view by the model's depth, shows the pixel, else 0;
+    - ``warp``: least absolute difference, mean over RGB, to the photographs that show it, 0 where none does.
 
     Args:
         features: by name.
@@ -179,7 +181,7 @@ def error_map(
     features = {"empty": (1 - alpha).clamp_min(0), "contrast": contrast(image)}
     if isinstance(moments_fn, ListMoments):
         features["colors"] = moments_fn.color_variance(expected, view).sqrt()
-        layout = "CHW"  # of its moments, whatever that of the renderer
+        layout = "CHW"  # of its moments, whatever the layout of the renderer
     if moments_fn is not None:
         moments = moments_fn(opacity.detach().clone(), view, Multiplier.dropout(p or PLAIN_RATE), None)
         features["deviation"] = read_moments(moments, layout=layout).variance.mean(0).clamp_min(0).sqrt()

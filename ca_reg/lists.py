@@ -57,7 +57,7 @@ class ListMoments:
     The lists must be complete. Renderers stop at an opaque surface, but what lies behind it shows when splats of the
     surface are dropped, so a list that ends there misses part of the variance.
 
-    Time and memory are proportional to the number of entries: of each at most 28 bytes besides the lists themselves.
+    Time and memory are proportional to the number of entries: at most 28 bytes for each, besides the lists themselves.
     Differentiable in everything that ``lists_fn`` is differentiable in, and in the multiplier.
 
     Args:
@@ -190,7 +190,7 @@ _CHUNK = 1 << 20
 
 
 class _Walk(NamedTuple):
-    """The entries of all lists, by their place in a list: the last of the longest first, the nearest of all last.
+    """The entries of all lists, from back to front: first the last of the longest list, finally the nearest of all.
 
     Pixels are sorted by the length of their lists, the longest first. So the entries of one place belong to the first
     pixels, as many as there are entries: a step of the recursion from back to front takes slices, without padding.
@@ -290,8 +290,8 @@ class _Walk(NamedTuple):
     def _chunks(self) -> list[tuple[list[int], Tensor, Tensor]]:
         """Return counts, Gaussians and alphas of all entries, whole places and about `_CHUNK` entries at a time.
 
-        Whatever belongs to the Gaussians or pixels costs as much for a chunk as for all entries: no chunk is shorter
-        than these are many.
+        Work per Gaussian and per pixel costs as much for one chunk as for all entries, so a chunk has several times as
+        many entries as there are Gaussians or pixels.
         """
         least = max(_CHUNK, 4 * len(self.ranks), 4 * len(self.values))
         counts: list[list[int]] = []

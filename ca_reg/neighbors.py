@@ -78,14 +78,14 @@ def _on_cpu(points: Tensor) -> Any:
 def _by_leaves(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Find exact neighbors by comparing small boxes of points with the boxes around them, all on the points' device.
 
-    The neighbors within the own box bound how far away the true ones can be; only boxes that are nearer are searched.
+    The neighbors within a point's own box bound how far away the true ones can be; only nearer boxes are searched.
     """
     n = len(points)
     ids, places = _leaves(points, max(LEAF, 4 * count))
     low, high = places.amin(1), places.amax(1)
 
     def gaps(rows: Tensor) -> Tensor:
-        """Return the squared distances of these boxes to all, (rows, leaves); below 0 to itself if none is nearer."""
+        """Return the squared distances of these boxes to all, (rows, leaves); below 0 to itself if points coincide."""
         found = torch.maximum(low[rows, None] - high, low - high[rows, None]).clamp_min_(0).square_().sum(-1)
         found[every[: len(rows)], rows] -= (reach[rows] == 0).to(found)
         return found
@@ -116,7 +116,7 @@ def _by_leaves(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
     squares, indices = points.new_empty(ids.numel(), count), torch.empty_like(ids).view(-1, 1).repeat(1, count)
     start = 0
     while start < len(order):
-        # Leaves with about as many boxes to search go together: each as many as the first, which has most.
+        # Leaves that search about as many boxes go together, and all search as many as the first, which needs most.
         rows = order[start : start + max(1, CHUNK_ELEMENTS // (pairs * most[start]))]
         squares[ids[rows]], indices[ids[rows]] = search(rows, gaps(rows).topk(most[start], largest=False).indices)
         start += len(rows)

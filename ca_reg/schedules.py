@@ -173,7 +173,7 @@ def is_captured() -> bool:
 
 
 def refuse_capture(what: str, remedy: str = "draw outside the graph") -> None:
-    """Raise a RuntimeError in the capture of a CUDA graph, which would keep for all replays ``what`` belongs to a step.
+    """Raise a RuntimeError while a CUDA graph is captured: all replays would keep ``what``, which belongs to a step.
 
     ``what`` ends with that step, as in "the degree 1 of the step 30".
     """

@@ -252,7 +252,7 @@ class CAScore:
         return x._replace(opacities=x.opacities.detach(), step=self.regularizer.step if x.step is None else x.step)
 
     def update(self, opacity: Tensor | Params, view: Any, *, index: int | None = None) -> CAResult:
-        """Measure one view and count it in the mean that :meth:`compute` returns; arguments and errors are a call's.
+        """Measure one view and count it in the mean that :meth:`compute` returns; arguments and errors as for a call.
 
         Views are counted from the last reset, and over ranks as :class:`torch.utils.data.DistributedSampler` deals them
         out without shuffling, which gives the result of a single process. If they are split in another way, ``index``
@@ -315,7 +315,7 @@ class CAScore:
     def _drawn(self, x: Params, index: int, count: int, differ: list[Tensor]) -> Iterator[Tensor]:
         """Yield the opacities of one view under ``count`` random draws, each a new tensor.
 
-        ``differ`` takes, for every draw but the first, whether it differs from that, as a tensor that is not yet read.
+        For every draw but the first, ``differ`` receives whether it differs from the first: a tensor, not read here.
         """
         # One generator per view: more renders extend the sequence, other views do not shift it.
         generator = PortableGenerator(self.seed, index)
@@ -324,8 +324,8 @@ class CAScore:
             drawn, *others = self._measured.replay(flat, self._measured.draw(flat, generator))
             if any(a is not b for a, b in zip(others, flat[1:], strict=True)):
                 raise ValueError(
-                    f"{type(self.regularizer).__name__} changes more than opacities, which is all that render_fn is "
-                    "given: leave out of the score what does."
+                    f"{type(self.regularizer).__name__} changes other parameters than opacities, which are all that "
+                    "render_fn is given: remove the members that change others from the score's regularizer."
                 )
             if first is None:
                 first = drawn.clone()  # the callable may edit its opacities
@@ -392,7 +392,7 @@ class _AdaptiveScore(CAScore):
     def _measure(self, x: Params, view: Any, index: int) -> CAResult:
         """Render until the error is small enough.
 
-        The region must not come from the sampled renders: pixels that they all happen to cover happen to vary little.
+        The region must not come from the sampled renders: pixels that all of them happen to cover tend to vary little.
         """
         settings = self.settings
         assert settings.max_samples is not None

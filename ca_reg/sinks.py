@@ -71,8 +71,8 @@ class WandbSink(Sink):
     """Write to a run of Weights & Biases; text becomes a part of its configuration.
 
     Args:
-        run: such as of ``wandb.init``, which stays open; by default a new one.
-        init: of ``wandb.init`` for a new one: ``project=``, ``name=``, ``mode="offline"``.
+        run: what ``wandb.init`` returned, which stays open; by default a new run.
+        init: arguments of ``wandb.init`` for a new run: ``project=``, ``name=``, ``mode="offline"``.
     """
 
     def __init__(self, run: Any = None, **init: Any) -> None:
@@ -100,8 +100,8 @@ class MLflowSink(Sink):
     Pictures need Pillow.
 
     Args:
-        run: such as of ``mlflow.start_run``, which stays active; by default a new one.
-        experiment: of a new one: its id, by default that of MLflow.
+        run: what ``mlflow.start_run`` returned, which stays active; by default a new run.
+        experiment: id of the experiment of a new run, by default MLflow's own.
     """
 
     def __init__(self, run: Any = None, *, experiment: str = "0") -> None:
@@ -114,6 +114,7 @@ class MLflowSink(Sink):
         elif np.ndim(x) == 3:
             self._client.log_image(self._run, x, f"images/{name}/{step:06d}.png")
         else:
+            # Of a histogram (N,) only the median is left, and its name says so; a number keeps its own.
             name += " median" * np.ndim(x)
             self._client.log_metric(self._run, re.sub(r"[^\w\-. /]", "", name), float(np.median(x)), step=step)
 

@@ -34,7 +34,7 @@ def chain_of(regularizer: nn.Module) -> Chain:
 
 
 class Signature:
-    """Binds the arguments of calls of one function, where all have names in a tenth of the time that inspect takes."""
+    """Binds the arguments of calls of one function; if all have names, in a tenth of the time that inspect takes."""
 
     def __init__(self, full: inspect.Signature) -> None:
         self.full = full
@@ -43,7 +43,7 @@ class Signature:
         self._all_named = all(x.kind in named for x in self._names.values())
 
     def bind(self, args: Sequence[Any], kwargs: Mapping[str, Any]) -> tuple[dict[str, Any], int | None]:
-        """Return arguments by name and how many were given by position; None if that does not describe them.
+        """Return the arguments by name, and how many were given by position, or None if no number describes that.
 
         Raises a TypeError for arguments that do not fit.
         """
@@ -197,7 +197,7 @@ class RasterizerCall(Call):
 
 
 def find_installed(rasterizers: Iterable[str]) -> list[str]:
-    """Return the modules of those, ``module:Class``, that can be found, not imported; ImportError if there is none."""
+    """Return the modules of ``module:Class`` that can be found, without an import; ImportError if there is none."""
     modules = dict.fromkeys(rasterizer.partition(":")[0] for rasterizer in rasterizers)
     found = [name for name in modules if name in sys.modules or find_spec(name.partition(".")[0]) is not None]
     if not found:
@@ -353,7 +353,7 @@ class CallSite(NamedTuple):
 
 
 def second_regularizers(chain: Chain) -> dict[str, str]:
-    """Return the variables by which the paper's code does what a chain does, and what that is called here."""
+    """Return the variables with which the paper's code does what a chain does, each with the class for it here."""
     perturbs = any(isinstance(member, OpacityNoise) for member in chain)
     names = {"dropout_factor": "GaussianDropout"} if chain.drops else {}
     return names | ({"sigma_noise": "OpacityNoise"} if perturbs else {})

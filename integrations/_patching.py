@@ -21,7 +21,7 @@ from ._calls import RasterizerCall, Signature, class_in, forward_signature
 
 
 class AfterImport(MetaPathFinder):
-    """Call back with a module right after its import, by whomever; at :meth:`start` if it is imported already."""
+    """Call back with a module right after anyone imports it; at :meth:`start` if it is imported already."""
 
     def __init__(self, callbacks: Mapping[str, Callable[[ModuleType], None]]) -> None:
         self._callbacks = callbacks
@@ -190,7 +190,7 @@ class PatchedClasses:
         self.names.append(f"{rasterizer.__module__}.{rasterizer.__qualname__}")
 
     def _wrap_model(self, model: type) -> None:
-        """Intercept the learning rate updates of a model, if they have an argument, which tells the iteration."""
+        """Intercept a model's updates of the learning rate, if they have an argument: it tells the iteration."""
         method = getattr(model, "update_learning_rate", None)
         if method is None or len(inspect.signature(method).parameters) < 2:
             return
@@ -199,8 +199,8 @@ class PatchedClasses:
             @functools.wraps(update)
             def update_learning_rate(model: Any, *args: Any, **kwargs: Any) -> Any:
                 given = [*args, *kwargs.values()]  # the iteration first, by whatever name
-                # Called by an override in a subclass, or not for Gaussians, as that of a network that deforms them:
-                # these have opacities by some name.
+                # Not counted: a call by the override of a subclass, and the update of something else than Gaussians,
+                # such as a network that deforms them. Gaussians have opacities, by whatever name.
                 has_opacities = any("opacit" in name for name in dir(model))
                 if self._updated is model or not given or not has_opacities:
                     return update(model, *args, **kwargs)

@@ -91,8 +91,8 @@ class Hook(abc.ABC):
     Optimizer steps count if a parameter group is named ``opacity`` or ``opacities``: other optimizers train networks,
     poses or exposures.
 
-    More than ``patience`` optimizer steps in a row without a regularized render, or training steps in all without a
-    render, are an error; 0 for no limit. ``tally`` counts what was done so far.
+    It is an error if more than ``patience`` optimizer steps in a row have no regularized render, or if more than that
+    many training steps in all have no render; 0 for no limit. ``tally`` counts what was done so far.
     """
 
     def __init__(self, patience: int) -> None:

@@ -325,7 +325,7 @@ def _audit(event: str, arguments: tuple[Any, ...]) -> None:
 
 
 def explain_download(error: BaseException, root: Path, saved: str | None) -> str | None:
-    """Describe a download of a script's own that failed: whose it is, and which model had been written; else None."""
+    """Describe a failed download of the script's own, with its file and the last model written; None if it was none."""
     cause: BaseException | None = error
     while cause is not None and type(cause).__module__.partition(".")[0] not in _NETWORK:
         cause = cause.__cause__ or cause.__context__

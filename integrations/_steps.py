@@ -56,8 +56,8 @@ class ModelSteps:
     def count_render(self, parameters: tuple[Tensor, ...], place: Hashable) -> bool:
         """Count a training render; return whether it was requested at the same place as the first one of its step.
 
-        A change of the parameters' versions shows that they were trained on: that begins a step, or, if calls of
-        update_learning_rate do, raises a RuntimeError, because such a call is missing.
+        A change of the parameters' versions shows that they were trained on, which begins a step. Where calls of
+        update_learning_rate begin the steps, it raises a RuntimeError instead, because one of these calls is missing.
         """
         versions = tuple((id(x), x._version) for x in parameters)
         trained = self.renders > 0 and versions != self._versions

@@ -33,7 +33,7 @@ Rasterization = Callable[..., tuple[Any, ...]]
 
 _HOLDERS = ("gsplat", "gsplat.rendering")  # the public modules that scripts import the functions from
 _OLDEST = (1, 4)
-_EVIDENCE = 10.0  # expected number of dropped Gaussians in a list, of which none was there; e^-10 by chance
+_EVIDENCE = 10.0  # dropped Gaussians expected in a list; that none is there by chance has probability e^-10
 
 
 def regularized(
@@ -176,8 +176,8 @@ class Regularized:
             per_camera = keep.unsqueeze(-2)  # [..., 1, N]
             info["radii"] = radii * (per_camera if radii.ndim == per_camera.ndim else per_camera.unsqueeze(-1))
         elif self._missed < _EVIDENCE:
-            # A matter of gsplat's version alone. The check synchronizes a GPU, so it ends once draws have dropped so
-            # many Gaussians that some would have been listed; a draw that drops none says nothing.
+            # Whether they are listed depends on gsplat's version alone. The check synchronizes a GPU, so it ends once
+            # enough Gaussians were dropped for some to have been listed; a draw that drops none tells nothing.
             batches = info.get("batch_ids")
             listed = (gaussians if batches is None else batches * keep.shape[-1] + gaussians).long()
             kept, share = int(keep.reshape(-1)[listed].sum()), float(keep.float().mean())

@@ -297,9 +297,9 @@ class RasterizerHook(Hook):
     def _refuse_to_train_on_a_viewer(self, gradient: Tensor) -> None:
         """Raise: a gradient arrived from a render taken for a viewer's."""
         raise RuntimeError(
-            f"a render for a viewer is trained on: its camera is a {self._viewer}, which the hook takes for that of a "
-            "viewer, so that it was scaled and not regularized. If the training views are of this class, say that "
-            "there is no viewer: viewer=None, in the launcher --viewer none."
+            f"a training step used a render that was taken for a viewer's, because its camera is a {self._viewer}: its "
+            "opacities were scaled, not regularized. If the training cameras are of this class, say that there is no "
+            "viewer: viewer=None, in the launcher --viewer none."
         )
 
 
@@ -309,9 +309,9 @@ def render_fn(
     """Turn the ``render`` of an INRIA-style code base into a render callable for :class:`ca_reg.CAScore`.
 
     The opacities are replaced on their way into the rasterizer, so neither the model nor ``render`` is modified, and a
-    :class:`RasterizerHook` leaves these renders alone. Image and alpha are those that
-    ``render`` returns, the alpha if it is named (the paper's code, Binocular3DGS, CoR-GS, DNGaussian). Else a second
-    pass with the same opacities measures it, white on black: a depth is never mistaken for an alpha.
+    :class:`RasterizerHook` leaves these renders alone. The image is the one that ``render`` returns, and so is the
+    alpha if it has a name there (the paper's code, Binocular3DGS, CoR-GS, DNGaussian). Otherwise a second pass with the
+    same opacities measures it, white on black: a depth is never mistaken for an alpha.
 
     ``render(view, gaussians, pipe, background)`` is the code base's, the other arguments are what it takes: model,
     pipeline settings, a color (3,). ``rasterizer`` is the class that it uses, by default the installed ones. A call

@@ -76,7 +76,7 @@ def _launch(options: argparse.Namespace, arguments: Sequence[str], watch: Watch)
     with ExitStack() as undo:
         if hook is not None:
             # Entered before the report, which reads what these processes have left.
-            # A process may have another script; of the launcher's own options it needs all that stand before this one.
+            # A process may run another script; it gets all of the launcher's own options, which stand before this one.
             name = ["-m", options.script] if options.module else [str(options.script.resolve())]
             own = arguments[: len(arguments) - len(options.arguments) - (2 if options.module else 1)]
             undo.enter_context(in_children(f"{__package__}.run:resume", own, name))
@@ -111,8 +111,8 @@ def _guard(options: argparse.Namespace, saved: str | None) -> None:
 def resume(arguments: Sequence[str], script: Sequence[str]) -> None:
     """Hook a process that a launched script has started, and report to the launcher when it ends.
 
-    ``arguments`` are the launcher's options; ``script``, the launched one, or ``-m`` and its module, gives way to that
-    of this process, if it has one.
+    ``arguments`` are the launcher's options, ``script`` is the launched one, or ``-m`` and its module. A script of this
+    process's own takes its place.
     """
     own = Path(sys.argv[0])
     this = [str(own)] if own.suffix == ".py" and own.is_file() else script

@@ -76,8 +76,9 @@ class CAScoreMetric(Metric):
         super().__init__(**kwargs)
         self.score = score if isinstance(score, CAScore) else CAScore(score)
         self.add_state("sums", default=torch.zeros(COLUMNS, dtype=torch.float64), dist_reduce_fx="sum")
-        # A collection lets metrics of equal state share their updates, and scores are small enough to look equal in
-        # its allclose, or all empty at first. Two digits in base 4096, because it compares with a relative tolerance.
+        # A collection lets metrics share their updates if their states are equal by allclose, as those of small scores
+        # are, or empty ones. A number of its own tells a metric apart: two digits in base 4096, as the tolerance is
+        # relative.
         digits = torch.tensor(divmod(next(_numbers), 4096), dtype=torch.float64)
         self.add_state("identity", default=digits, dist_reduce_fx="max")
 

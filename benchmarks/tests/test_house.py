@@ -9,7 +9,7 @@ from benchmarks import house
 FILES = {
     "ca_reg/__init__.py": '"""Doc."""\n\nfrom ca_reg.a import f\n\n__all__ = ["f", "__version__"]\n',
     "ca_reg/a.py": "def f():\n    from ca_reg import b  # late\n    return b\n",
-    "ca_reg/b.py": "# why\nimport ca_reg.a\n",
+    "ca_reg/b.py": "# why\nimport ca_reg.a  # noqa: F401\n",
     "integrations/__init__.py": "from reference_trainer.runs import run\n",
     "reference_trainer/__init__.py": "",
     "reference_trainer/files.py": "import reference_trainer.runs\n",
@@ -31,8 +31,18 @@ def test_the_table_counts_what_is_there(checkout, capsys):
     text = capsys.readouterr().out
     for line in ("| installed lines | 12 |", "| lines of ca_reg | 10 |", "| words in docs | 5 |",
                  "| names exported by ca_reg | 1 |", "| circles of imports | 1 |",
+                 "| `ca_reg` | 33.3 | 4 |", "| `integrations` | 0.0 | 4 |",
                  "- circle: ca_reg.", "- upward: reference_trainer.files -> reference_trainer.runs"):  # fmt: skip
         assert line in text
+
+
+@pytest.mark.parametrize(
+    ("line", "comments"),
+    [("x = 1  # unit", 1), ("x = 1  # fmt: skip", 0), ("x = 1  # type: ignore[misc, arg-type]  # noqa: E1, B2", 0),
+     ("x = 1  # noqa: B023 - called at once", 1), ("x = 1  # unit  # fmt: skip", 1), ('x = "# no"', 0)],
+)  # fmt: skip
+def test_what_is_written_for_linters_is_no_comment(line, comments):
+    assert house.comments_and_code(f"{line}\n") == (comments, 1)
 
 
 def test_no_way_from_the_readme_is_lost():

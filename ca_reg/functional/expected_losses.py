@@ -115,6 +115,10 @@ class _ExpectedAbsoluteError(torch.autograd.Function):
 
 def _slopes(d: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
     """Return the derivatives of ``E |x|`` in mean and variance of a normal x."""
+    # For a normal x, d/dd E f(x) = E f'(x) and d/dv E f(x) = E f''(x) / 2. With f = |x|, f' is the sign of x and f''
+    # twice a delta at 0, so that with z = d / sqrt(2 v)
+    #     dE/dd = P(x > 0) - P(x < 0) = erf(z),        dE/dv = the density of x at 0 = exp(-z^2) / sqrt(2 pi v).
+    # E doubles where d and sqrt(v) double, so Euler's theorem gives E itself, d dE/dd + 2 v dE/dv.
     scale = (2.0 * variance).rsqrt()
     z = (d * scale).clamp(-_FAR, _FAR)  # which keeps 0 * inf out of second derivatives
     density = torch.nn.functional.threshold((-z.square()).exp(), 2.0 * math.exp(-_FAR * _FAR), 0.0)

@@ -53,6 +53,8 @@ class ClusteredDropout(Regularizer):
 
     def anchor_rate(self, rate: Rate, neighbors: Tensor) -> Rate:
         """Return the rate of the anchors, given ``p`` at the step and the neighbor indices of all Gaussians, (N, k)."""
+        # A Gaussian is dropped with its own cluster and with that of everyone whose neighbor it is: it stays if none of
+        # its c anchors is drawn, so that the mean of stay^c over all Gaussians must be 1 - p.
         clusters = 1 + neighbors.flatten().bincount(minlength=len(neighbors))
         counts = clusters.bincount().double().cpu()
         sizes = torch.arange(len(counts)).to(counts)

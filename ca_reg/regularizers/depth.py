@@ -89,6 +89,7 @@ class D2GSDropout(SurroundingsDropout):
             return 0.0
         if self.literal:
             assert x.view_matrix is not None
+            # The transposed matrix: the source takes the column for the row.
             depths = x._replace(view_matrix=x.view_matrix.mT).depths
             nearness, density = 1 - _min_max(depths), _first(look(), len(depths))
         else:
@@ -96,6 +97,7 @@ class D2GSDropout(SurroundingsDropout):
             nearness, density = 1 - relative_ranks(depths), look()
         ordered = depths.sort().values
         near, far = (ordered[int(len(depths) * quantile)] for quantile in QUANTILES)
+        # From far to near, each overwriting the one before where it reaches.
         tier = torch.full_like(depths, TIERS[2]).masked_fill_(depths <= far, TIERS[1])
         tier.masked_fill_(depths <= near, TIERS[0])
         return rate * tier * (self.depth_weight * nearness + self.density_weight * density)

@@ -87,6 +87,7 @@ def with_own_memory(module: M) -> M:
     """
     if not any(isinstance(part, Refreshed) for part in module.modules()):
         return module
+    # Shallow: parameters and schedules stay shared, only the memory is its own.
     twin = copy.copy(module)
     twin._modules = {name: part and with_own_memory(part) for name, part in module._modules.items()}
     if isinstance(twin, Refreshed):

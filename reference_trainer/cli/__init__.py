@@ -52,6 +52,7 @@ def _run(arguments: Sequence[str]) -> None:
             check_device(computing.device, here=not (isinstance(command, Compare) and command.elsewhere))
         command()
     except BrokenPipeError:  # the reader of the output, such as head, has stopped reading
+        # Python flushes the output once more when it exits, which must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except (ValueError, OSError, ImportError, RuntimeError) as error:
@@ -98,6 +99,7 @@ def _parse(arguments: Sequence[str]) -> Any:
         raise ValueError(f"study {arguments[1]} is now {moved}, called from a checkout of the repository.")
     usual = TrainConfig()
     refuse_old_options(arguments, [usual.renderer, *(f"--{name}" for name in vars(usual))])
+    # The recipe and its length decide on the defaults that tyro shows and fills in: they are read before tyro reads.
     peek = argparse.ArgumentParser(prog="ca-reg", add_help=False, allow_abbrev=False)
     peek.add_argument("--recipe", nargs="?")
     peek.add_argument("--iterations", nargs="?")

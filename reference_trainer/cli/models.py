@@ -61,12 +61,14 @@ class Evaluate:
 
         place = place_of(self.run, self.scene, self.orbit)
         self.rendering.begin(self.device)
+        # Modules named on this command line are trusted; --trust is for those that a file names.
         trust = {*self.trust, *modules_named(self.regularizer or "")}
         shared: dict[str, Any] = {
             "samples": self.samples, "seed": self.seed, "perceptual": load_lpips(self.lpips, device=self.device)
         }  # fmt: skip
         if place is None:
             model, scene = load_run_model(self.run, self.device, regularizer=self.regularizer, trust=trust)
+            # A folder of its own, or the scores of another regularizer would take the place of the run's.
             name = "evaluation" if self.regularizer is None else f"evaluation_{folder_name(self.regularizer)}"
             out = self.out or self.run / name
             measure(model, measured_views(scene), out, about={"scene": scene.name}, **shared)
@@ -94,6 +96,7 @@ class Render:
     mask: float | None = None
     """With --what error: also write masks, white where the expected error is above this, such as 0.05: where to repaint
     (an absolute difference of colors in [0, 1])."""
+    # None, not 60, so that `check` can refuse it where it has no effect.
     frames: int | None = None
     """With --what flight: its pictures, by default 60."""
     out: Path | None = None
@@ -210,6 +213,7 @@ class View:
 
         trust = {*self.trust, *modules_named(self.regularizer or "")}
         shared: dict[str, Any] = {"regularizer": self.regularizer, "device": self.device, "trust": trust}
+        # First of all: a port in use, or a missing viser, is refused before anything is compiled or loaded.
         with Viewer(self.port) as viewer:
             self.rendering.begin(self.device, trains=True)  # so that no later picture waits for the compiler
             for run in self.runs:
@@ -296,6 +300,7 @@ class Clean:
 
         place = place_of(self.ply, self.scene, self.orbit)
         assert place is not None
+        # Refining needs photographs. With an orbit nothing is trained, so the loops of a training are not compiled.
         self.rendering.begin(self.device, trains=isinstance(place, SceneOptions))
         clean_ply(
             self.ply,

@@ -90,6 +90,7 @@ def place_of(source: Path, scene: PlyScene, orbit: OrbitOptions) -> SceneOptions
             )
         return None
     if scene.path == "orbit":
+        # No PLY says over which color it was trained, so this option applies to an orbit as well.
         if replace(scene, background="auto") != PlyScene():
             raise ValueError("without photographs no option of a scene but --background applies: give --scene.")
         return orbit
@@ -117,6 +118,7 @@ def check_ply(source: Path) -> None:
 def check_out(out: Path | None, source: Path, place: SceneOptions | OrbitOptions | None = None) -> None:
     """Refuse, with a ValueError, to write into the photographs of a run, or of a PLY whose `place_of` is given."""
     if out is not None:
+        # Only its settings say where the photographs of a run are.
         scene = read_run_settings(source / CONFIG)[0] if place is None else place
         check_output(out, scene.path if isinstance(scene, SceneOptions) else None, ())
 
@@ -133,6 +135,7 @@ def refuse_old_options(arguments: Sequence[str], known: Sequence[str]) -> None:
 
     Those that are ``known`` are in use: what is old here may not be everywhere yet.
     """
+    # --engine=loops is taken apart like --engine loops, so that a value always follows its option.
     words = [part for word in arguments for part in (word.split("=", 1) if word.startswith("--") else [word])]
     for (option, value), now in _OLD.items():
         for word, after in zip(words, [*words, ""][1:], strict=True):

@@ -36,9 +36,11 @@ class Poses:
             raise FileNotFoundError(f"there is no folder {self.photos}: give the folder of the photographs.")
 
     def __call__(self) -> None:
+        # Imported here, as in every command: torch takes seconds, and neither --help nor a mistyped path should wait.
         from reference_trainer.scenes.poses import find_poses
 
         found = find_poses(self.photos, self.out, camera=self.camera, seed=self.seed, progress=True)
+        # The cameras are in <scene>/sparse/0.
         scene = found.folder.parents[1]
         out = shlex.quote(f"runs/{scene.resolve().name}")
         command = f"ca-reg train {shlex.quote(str(scene))} --recipe sparse --out {out}"
@@ -70,6 +72,7 @@ class Names:
                 made = registry[name]
                 about = (inspect.getdoc(made) or "").partition("\n")[0]
                 arguments = inspect.signature(made)
+                # Without types: the user writes values, and the defaults show of what kind.
                 bare = [each.replace(annotation=each.empty) for each in arguments.parameters.values()]
                 print(f"  {name}{arguments.replace(parameters=bare, return_annotation=arguments.empty)}\n      {about}")
 
@@ -100,6 +103,7 @@ class Warmup:
     def __call__(self) -> None:
         from reference_trainer.runs.warmup import warm_up
 
+        # Only the CPU has loops that can be compiled ahead, whatever card there is.
         self.rendering.begin("cpu")
         names = warm_up()
         print(f"Compiled: {', '.join(names)}." if names else "Nothing is left to compile.")

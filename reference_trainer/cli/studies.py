@@ -62,6 +62,7 @@ class Stability:
 class Study:
     """Measure something about the method itself."""
 
+    # tyro makes a command of every member.
     what: ErrorRuntime | Stability
 
     def __call__(self) -> None:

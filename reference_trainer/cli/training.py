@@ -93,7 +93,7 @@ class Demo:
             config=TrainConfig(iterations=steps, opacity_reset_every=0, densify_from=min(500, steps // 4)),
             seeds=self.seeds,
             jobs=self.jobs,
-            executor="processes",
+            executor="processes",  # of this machine, even where $RAY_ADDRESS names a cluster
             monitor_every=max(1, steps // 5),
             rendering=self.rendering,
         )
@@ -149,6 +149,7 @@ class Train:
         from reference_trainer.runs.run import Monitoring, run_experiment
         from reference_trainer.training.randomness import deterministic
 
+        # A training that is shorter than the interval is measured once, at its end.
         between = min(self.monitor_every, self.config.iterations)
         pictures = between >= PICTURES_FROM if self.monitor_pictures == "auto" else self.monitor_pictures == "on"
         monitoring = Monitoring(self.monitor_every, pictures=pictures, sinks=self.log_to)
@@ -206,6 +207,7 @@ class Plan:
 
     def check(self) -> None:
         check_scenes([_chosen(self.scene, self.folder).path])
+        # An earlier plan, known by its entry for the items, may be overwritten, and no other file.
         if self.out is not None and self.out.exists() and '"items"' not in self.out.read_text("utf-8", "ignore"):
             raise ValueError(f"{self.out} is no plan of ca-reg and is not overwritten: give another --out.")
 
@@ -314,7 +316,9 @@ class Compare:
         comparisons = compare(scene_folders(self._paths, self.scene, self.out), chosen, range(self.seeds), running)
         report(comparisons)
         trust = set[str]().union(*map(modules_named, (self.scene, *chosen.values())))  # named on this command line
+        # The pages are written here, where the machines of a cluster may have cards and this one none.
         here = self.device if not self.elsewhere else "cpu"
+        # Where every run failed there is nothing to show.
         for folder in [folder for folder, comparison in comparisons.items() if comparison.runs]:
             write_report([folder], device=here, trust=trust)
         if any(comparison.failures for comparison in comparisons.values()):

@@ -59,7 +59,7 @@ class Unknown:
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
         raise ValueError(
             f"the rasterizer's output {self.name} is used, which the stand-in does not know by this name: {SAY_IT}; "
-            "what is none of these needs CUDA."
+            "anything else needs CUDA."
         )
 
     def __getattr__(self, attribute: str) -> Any:
@@ -109,8 +109,8 @@ class Picture(Tensor):
         last = max(first.start or 0, (first.stop or 1) - 1) if isinstance(first, slice) else first
         if isinstance(last, int) and last >= len(self):
             raise ValueError(
-                f"channel {last} of a picture is asked for, of which the stand-in rasterizer draws {len(self)} "
-                f"channels: {SAY_IT}; what is none of these needs CUDA."
+                f"channel {last} of a picture was asked for, but the stand-in rasterizer draws {len(self)} channels: "
+                f"{SAY_IT}; anything else needs CUDA."
             )
         return super().__getitem__(index)
 

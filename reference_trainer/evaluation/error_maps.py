@@ -23,7 +23,7 @@ AGREEMENT = 0.05
 errors of depth of a good model (2 to 3 %), narrower than the step from an object to what is behind it."""
 
 NEAREST = 8
-"""Photographs that are brought into a view, of the nearest cameras, and training views that the unit is taken from."""
+"""Photographs, of the nearest cameras, that are warped into a view; and training views that the unit is taken from."""
 
 _COVERED = 0.5  # alpha, below which a pixel has no surface to look at from elsewhere
 _TINY = 1e-4  # alpha, below which a pixel has no color of its own
@@ -32,12 +32,12 @@ _TINY = 1e-4  # alpha, below which a pixel has no color of its own
 class ErrorMaps:
     """Expect the error of views without a photograph; what the views of a model share is computed once.
 
-    Which pixels are worse than others, the weights tell that were fitted on other scenes. How large errors are in this
-    scene, its photographs tell: each training photograph is predicted from the others, brought into it by the model's
-    depth, and what they differ by, over what the sum of features expects there, is the unit of the maps.
+    Weights fitted on other scenes rank the pixels; this scene's photographs set the scale. Each training photograph is
+    predicted from the others, which are warped into it by the model's depth. The unit of the maps follows from the
+    ratio of the measured difference to the one that the sum of features expects there.
 
-    For each training view this takes what a map takes, and a render; for each view two renders, a pass of moments, and
-    the warps.
+    A map takes two renders, a pass of moments, and the warps. Before the first, every training view takes a render, and
+    up to `NEAREST` of them a map.
 
     Args:
         model: which, on the views' device.

@@ -127,7 +127,7 @@ def evaluate(
         seed: of the CA score's masks.
         perceptual: a perceptual metric, or None to leave it out.
         pictures: folder for two PNG files per view, ``<split>/<view>``: the render, and a panel of photograph, render,
-            error, expected error and exact CA map, or without a photograph of the render, the expected error and the
+            error, expected error and exact CA map, or, where there is no photograph, of render, expected error and the
             maps of all scores; None for none.
         partial: file for the scores of finished views, see `ResultStore`: an interrupted evaluation continues with the
             next view. The caller removes it once the result is written.
@@ -239,7 +239,7 @@ def _measure(
 def training_snapshot(model: TrainedModel, view: View) -> dict[str, Tensor]:
     """Return what is worth watching while a model trains: pictures of a view (3, H, W), and shares of the exact score.
 
-    Co-adaptation and shares, of the Gaussians that have one, are at drop rate 1/2.
+    Co-adaptation and shares are at drop rate 1/2; Gaussians without a share are left out.
     """
     image = model.test_rendering(view).image.clamp(0, 1)
     score = model.exact_ca_score(drop_rate=0.5)

@@ -74,8 +74,8 @@ class DepthErrors(NamedTuple):
 def depth_errors(depth: Tensor, truth: Tensor) -> DepthErrors:
     """Return the errors of a depth (H, W) over the pixels where the true depth is known, that is not 0; in float64.
 
-    Both are along the camera's z axis, in world units; of a render, the accumulated depth over alpha. No scale or shift
-    is fitted.
+    Both are along the camera's z axis, in world units. The depth of a render is its accumulated depth divided by alpha.
+    No scale or shift is fitted.
 
     Example:
         >>> import torch

@@ -101,9 +101,9 @@ def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None =
     """Find the Gaussians that hang where nobody took a photograph, see `ca_reg.attribution.hanging`.
 
     What hangs is left out and the rest measured again, because it may have hidden more, until nothing hangs or
-    ``rounds`` are over. All `unseen_views` are judged together; of many training cameras each of `amid_views`
-    by itself as well, because what hangs at one of many places is little in the mean over all. Scores are
-    those of the drop rate of the training, or of 0.2 after noise. No photograph is looked at. Costs about four renders
+    ``rounds`` are over. All `unseen_views` are judged together. With many training cameras each of `amid_views` is
+    also judged separately, because what hangs at one of many places is little in the mean over all. Scores are at the
+    drop rate of the training, at 0.2 if that is 0. No photograph is looked at. Costs about four renders
     per camera and round.
 
     Args:
@@ -134,7 +134,7 @@ def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None =
             shares, where_highest, score = unseen_shares(rest, of)
             of_views += [score] * len(of)
             if number < rounds:
-                # At a single place as if three photographs had been taken: what many show is rarely suspected.
+                # At a single place divided by 3, not by all: what many photographs show is then rarely suspected.
                 mean = here / (len(taken) if of is together else 3)
                 found = hanging(shares, blend_weights(plain, of) / len(of), mean) & ~hang
                 where.update(of[i].name for i in where_highest[found].tolist())

@@ -1,4 +1,4 @@
-"""One style for all figures: a strategy has one color everywhere, people's names, and text that is readable at 700 px.
+"""One style for all figures: a strategy has one color everywhere, readable names, and text that is legible at 700 px.
 
 A figure is at most `WIDTH` inches wide, so that its text, of 10 points, has 12 pixels where a page shows it 700 wide.
 """
@@ -50,7 +50,7 @@ _NAMES = {
 
 
 def readable(label: str) -> str:
-    """Return people's name of a strategy, a setting or a scene: without schedules, with a single number at most.
+    """Return a readable name of a strategy, a setting or a scene: without schedules, with a single number at most.
 
     Example:
         >>> readable("dngaussian, dropout(0.2)"), readable("d2gs(ramp(0.05, 0.3, 0, 10_000))"), readable("both/seed_0")

@@ -66,7 +66,7 @@ QUANTITIES = {
 """By name, in the order of the columns."""
 
 _NOT_EVERYWHERE = re.compile("psnr|ssim|lpips|depth")
-"""How the names of quantities begin that need a photograph, a view that was not trained on, weights or a true depth."""
+"""Beginnings of the quantities that need a photograph, a view that was not trained on, weights or a true depth."""
 _HIGHEST_IS_BEST = {"PSNR (dB)": True, "SSIM": True, "LPIPS": False, EXACT: False, "depth AbsRel": False}
 
 
@@ -230,7 +230,14 @@ def print_table(markdown: str) -> None:
 
 @dataclass(frozen=True)
 class _Column:
-    """A column: its cells, the title first; whether they are figures, to the right; the bold ones; if all are whole."""
+    """A column of a table in the terminal.
+
+    Args:
+        cells: its texts, the title first.
+        figures: whether they are figures, which are aligned to the right.
+        bold: positions of the cells in bold.
+        whole: whether no cell but the title may be broken into lines.
+    """
 
     cells: Sequence[str]
     figures: bool

@@ -32,7 +32,7 @@ class TrainedModel:
         background: color behind them, shape (3,).
         regularizer: what it was trained with, an expression for `ca_reg.regularizers.parse`; it decides the test-time
             opacities and the drop rate of the paper's CA protocol.
-        step: number of training steps; schedules stand where the last of them used them.
+        step: number of training steps; schedules have the values of the last one.
         sh_degree: highest band of spherical harmonics to use; None for all.
         for_rendering: whether the opacities are the test-time ones already and the plain ones are unknown.
     """

@@ -153,7 +153,7 @@ class Gaussians:
 def positions(index: Tensor) -> Tensor:
     """Return the positions where a mask is set; positions as they are.
 
-    For several tensors that one mask selects from: a card makes the host wait for every mask, to know the size.
+    Use it where one mask selects from several tensors: each selection by a mask makes the host wait for a card.
 
     Example:
         >>> positions(torch.tensor([True, False, True]))
@@ -179,8 +179,10 @@ def compute_relocation(
         (0.5, 0.9111)
     """
     n = ratios.long().clamp(1, len(binoms))
+    # n layers let as much light pass as the one: (1 - new)^n = 1 - old.
     opacity = (1 - (1 - opacities.double()) ** (1 / n.double())).clamp_min(min_opacity)
     k = torch.arange(len(binoms), dtype=torch.float64, device=binoms.device)
+    # The scales shrink by old / sum_i<n sum_k C(i, k) (-1)^k new^(k + 1) / sqrt(k + 1); the sum over i is the cumsum.
     # The signs of the terms alternate: in single precision they would cancel.
     terms = binoms.double().cumsum(0) * (-1) ** k / (k + 1).sqrt()
     shrink = opacities.double() / (terms[n - 1] * opacity[:, None] ** (k + 1)).sum(1)

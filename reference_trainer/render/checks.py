@@ -32,9 +32,9 @@ class NotFiniteError(ValueError):
 def numbers_to_check(
     depths: Tensor, opacities: Tensor, projection: Projection, colors: Tensor, camera: Camera
 ) -> Tensor:
-    """Return the sum of the projected depths, numbers that are finite if all is, and the 16 of the pose.
+    """Return the sum of the projected depths, numbers that are finite if everything is, and the 16 of the pose.
 
-    ``depths`` and ``opacities``, those of all Gaussians, decide which of them are rendered.
+    ``depths`` and ``opacities`` are those of all Gaussians, as a nan among them would decide who is not rendered.
     """
     norms = torch._foreach_norm([depths, opacities, projection.means, projection.covariances, colors])
     sums = [x.reshape(1) for x in (projection.depths.sum(), *norms)]

@@ -33,7 +33,7 @@ from reference_trainer.scenes.virtual_cameras import measured_views, unseen_view
 __all__ = ["Findings", "find", "pictures_of"]
 
 MOST_UNSEEN = 27
-"""Cameras that nobody took, of which the worst are shown: all there are between and beyond three."""
+"""Cameras without a photograph, at most, among which the worst are found: all of those between and beyond three."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,7 @@ class Findings:
         means = gaussians.means - center
         scale = means.norm(dim=1).median().clamp_min(1e-9)
         columns = [
+            # Relative to the distance from the middle: most Gaussians are close to it, a few very far away.
             (means.sign() * (means / scale).abs().log1p(), 2e-4),
             (gaussians.log_scales, 0.02),
             (normalize(gaussians.quaternions, dim=1), 1 / 256),
@@ -129,7 +130,7 @@ class Findings:
 def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Collection[str] = ()) -> Findings:
     """Draw a run's last checkpoint from its views, and attribute the exact score at drop rate 1/2 to its Gaussians.
 
-    What is expected of a view is expected from the model and the training photographs, so not of those themselves.
+    The expected error follows from the model and the training photographs, so these have none themselves.
 
     Args:
         run: its folder.

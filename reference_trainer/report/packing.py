@@ -18,6 +18,7 @@ __all__ = ["heat_uri", "image_uri", "quantized"]
 
 def image_uri(image: Tensor) -> str:
     """Return an image (3, H, W) in [0, 1] as the data URI of a JPEG of high quality."""
+    # Without the usual subsampling, which halves the resolution of colors.
     return _uri(as_pillow(image), "jpeg", quality=92, subsampling=0, progressive=True, optimize=True)
 
 
@@ -53,6 +54,8 @@ def quantized(columns: Iterable[tuple[Tensor, float]]) -> dict[str, Any]:
     for block, least in columns:
         block = block.detach().double().cpu()
         step = max(least, block.abs().max().item() / 32767) if block.numel() else least
+        # Small numbers of either sign become small non-negative ones, whose high bytes are all 0. These bytes stand
+        # together, so that they cost next to nothing once compressed.
         whole = (block / step).round().to(torch.int64)
         coded = torch.where(whole < 0, -2 * whole - 1, 2 * whole)
         planes += [part.to(torch.uint8).numpy().tobytes() for of in coded.T for part in (of % 256, of // 256)]

@@ -59,9 +59,9 @@ __all__ = ["compare_two", "labels", "view_name", "write_report"]
 _log = logging.getLogger(__name__)
 
 VIEWS = 8
-"""Of each split, unless others are asked for."""
+"""Of each split, unless another number is asked for."""
 EACH = 3
-"""Views that nobody took, at most, of those between the training cameras and of those beyond."""
+"""Views that nobody took, at most, between the training cameras, and as many beyond them."""
 
 
 def write_report(
@@ -76,11 +76,11 @@ def write_report(
 
     It begins with a verdict and its evidence, and shows the scores with their differences to the first run, CA and PSNR
     against the step, every model in 3D (all turn together) in its colors or its co-adaptation heat, any two of
-    photograph, render, error, expected error and CA map of all runs upon each other, the views that nobody took of
-    which least is expected, what hangs there, and how concentrated the score is on few Gaussians. Runs come in the
-    order baseline, dropout, noise, both, under natural names. The heat is the share of the exact score at drop rate 1/2
-    per blend weight, over the views of the page, on one logarithmic scale for all runs around the mean of the first run
-    that has one. What a run lacks is left out, and the page says so.
+    photograph, render, error, expected error and CA map of all runs on top of each other, the views that nobody took
+    with the lowest expected PSNR, what hangs there, and how concentrated the score is on few Gaussians. Runs come in
+    the order baseline, dropout, noise, both, under natural names. The heat is the share of the exact score at drop rate
+    1/2 per blend weight, over the views of the page, on one logarithmic scale for all runs around the mean of the first
+    run that has one. What a run lacks is left out, and the page says so.
 
     Args:
         runs: their folders, finished or not; the folder of a comparison stands for the first seed of each strategy, and
@@ -114,6 +114,7 @@ def write_report(
                 f"{found[0].scene.name} and {run} on {found[-1].scene.name}: write a report for each."
             )
     data = _data(dict(zip(names, runs, strict=True)), found, whole=set(runs) - set(folders))
+    # The page names the command that makes it again, without what is usual.
     command = ["ca-reg", "report", *map(str, folders)]
     command += ["--views", str(views)] * (views != VIEWS) + ["--trust", *sorted(trust)] * bool(trust)
     data["made"] = f"{shlex.join(command)} · ca_reg {ca_reg.__version__} · {datetime.now():%Y-%m-%d %H:%M}"
@@ -154,6 +155,7 @@ def compare_two(first: Path, second: Path) -> tuple[list[dict[str, object]], lis
     if len(configs) < 2:
         raise ValueError(f"expected two different runs, got {first} twice.")
     viewed = [{(runs[0]["scene"], view["split"], view["name"]) for view in runs[0]["views"]} for runs in both]
+    # A split whose views differ is left out as a whole: a mean over other views is another quantity.
     other = {split for _, split, _ in viewed[0] ^ viewed[1]}
     shared = {split for _, split, _ in viewed[0] & viewed[1]} - other
     if not shared:
@@ -263,6 +265,7 @@ def _strategies(
             for other in map(read_results, sorted(path.parent for path in run.parent.glob(f"seed_*/{RESULTS}"))):
                 of.setdefault(other["config"]["seed"], other)
         key: object = label if run in whole else (scene, dataclasses.replace(config, seed=0))
+        # The same settings and seed again, perhaps from another machine: kept apart, or one would hide the other.
         if key in found and config.seed in found[key][1]:
             key = label
         if of:
@@ -312,6 +315,7 @@ def _curves(runs: dict[str, Path]) -> tuple[list[dict[str, Any]], list[str]]:
                 curve: dict[str, Any] = {"run": label, "group": group, "step": columns["step"].tolist()}
                 for name, unit in (("ca", 1e-3), ("psnr", 1.0)):
                     values = columns.get(f"{name}/{group}", np.full(len(columns["step"]), np.nan)) / unit
+                    # None, as JSON has no nan.
                     curve[name] = [round(x, 4) if np.isfinite(x) else None for x in values.tolist()]
                 curves.append(curve)
     return curves, missing
@@ -342,6 +346,7 @@ def _views(found: Sequence[Findings]) -> list[dict[str, Any]]:
         for split, group in each.views.items():
             for view in group:
                 entry = _entry(view, view_name(split, view.name), len(found))
+                # By pose as well: views between and around the cameras only have numbers, and another split moves them.
                 entry = views.setdefault((split, view.name, str(entry["pose"])), entry)
                 entry["pictures"][number] = next(pictures)
     return list(views.values())
@@ -362,9 +367,9 @@ def _entry(view: Viewpoint, name: str, runs: int) -> dict[str, Any]:
 
 
 def _unseen(found: Sequence[Findings]) -> list[dict[str, Any]]:
-    """Return the views that nobody took of which least is expected, of any run, the worst first.
+    """Return the views that nobody took with the lowest expected PSNR in any run, the worst first.
 
-    Of the cameras of one way, between the same two or beyond the same one, only the worst: the others look like it.
+    Cameras between the same two, or beyond the same one, look alike: only the worst of them is kept.
     """
     least: dict[str, tuple[float, Viewpoint]] = {}
     for view, expected in (one for each in found for one in each.unseen):
@@ -379,6 +384,8 @@ def _unseen(found: Sequence[Findings]) -> list[dict[str, Any]]:
         entries.append(_entry(view, view.name, len(found)))
         for number, each in enumerate(found):
             for other, expected in each.unseen:
+                # By pose, as runs that were trained on different photographs may have
+                # other cameras under the same name.
                 if torch.equal(other.camera.world_to_camera, view.camera.world_to_camera):
                     entries[-1]["pictures"][number] = pictures_of(each.model, other, expected)
     return entries

@@ -55,6 +55,7 @@ def natural_order(config: TrainConfig) -> tuple[int, bool]:
     kinds = set(re.sub(r"\([^)]*\)", "", config.regularizers).replace("+", " ").split())
     order = [set(), {"dropout"}, {"noise"}, {"dropout", "noise"}, kinds]
     other = (config.loss, config.density) != (_USUAL.loss, _USUAL.density)
+    # `kinds` itself closes the list: any other combination gets its index.
     return 4 if other else order.index(kinds), config.analytic
 
 
@@ -109,11 +110,12 @@ def _difference(rows: Rows, reference: Rows, split: str, key: str) -> tuple[floa
     if not values or not others:
         return None
     (mean, std), (other, spread) = mean_std(values), mean_std(others)
+    # Variances of independent means add up. With one seed the standard deviation, and so the margin, is nan.
     return mean - other, 2 * math.sqrt(std**2 / len(values) + spread**2 / len(others))
 
 
 def differences(first: Rows, second: Rows) -> list[dict[str, object]]:
-    """Return a row for every score that both have: of each, the difference, and whether seeds tell them apart.
+    """Return a row for every score that both have: both scores, the difference, and whether seeds tell them apart.
 
     The difference is that of the means, with two of its standard errors. Below `FEWEST_SEEDS` of either, the spread is
     not known well enough to tell anything apart.
@@ -142,8 +144,8 @@ def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:
     """Return the columns of the scores: ``split``, ``title``, ``cells`` of ``text``, ``best``, ``delta``, ``better``.
 
     ``delta`` is the difference to the first strategy as text, ``better`` whether that is an improvement (None where
-    neither direction is one). The best figure of a column that has a best is marked, all that share it. Below what is
-    expected stands the ``interval`` of a view, the mean of its ends.
+    neither direction is one). In a column that has a best figure, it is marked, and so are all that share it. A cell of
+    the expected PSNR also has the ``interval`` of a view: the means of its two ends.
     """
     columns = []
     unseen = {split for of in strategies for run in of.results for split in run["mean"]}
@@ -152,6 +154,7 @@ def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:
         means = [of.mean(split, key) / unit for of in strategies]
         if (split and split not in unseen) or all(map(math.isnan, means)):
             continue
+        # Compared as they are shown: two figures that read the same must not be ranked.
         rounded = [round(mean, decimals) for mean in means]
         known = [mean for mean in rounded if not math.isnan(mean)]
         best = None if highest is None or len(known) < 2 else max(known) if highest else min(known)
@@ -216,7 +219,7 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
 
 
 def _said(rows: Rows, reference: Rows, split: str) -> tuple[str, str]:
-    """Return how a strategy differs from the reference in PSNR and co-adaptation, and what leads to the latter's name.
+    """Return how a strategy differs from the reference in PSNR and co-adaptation, and the word before its name.
 
     Both are empty if the two share no score.
     """

@@ -119,13 +119,13 @@ def clean_ply(
 ) -> dict[str, Evaluation]:
     """Write a model without the Gaussians of highest share of the exact score per blend weight, or without what hangs.
 
-    With ``hanging`` those go that `guard` finds, which is for models trained with dropout or noise. Otherwise, shares
+    With ``hanging`` those that `guard` finds are removed, from models trained with dropout or noise. Otherwise, shares
     (at drop rate 1/2) and weights are measured at the training views, or at those of the orbit, and the ``fraction``,
-    in (0, 1), of all Gaussians is removed; those without a share stay. The removal leaves holes, which ``refine``
-    training steps on the photographs close, without densification and with the regularizers of the model: by default
-    100, or none with ``hanging``, which leaves no holes, or without a scene. Logs a table of quality and co-adaptation
-    before and after, and says so if the photographs are fitted worse, or the model is none of the scene. Returns the
-    evaluations by row of the table.
+    in (0, 1), of all Gaussians is removed; those without a share stay. This leaves holes, which ``refine`` training
+    steps on the photographs close, without densification and with the regularizers of the model: by default 100, but
+    none with ``hanging``, which leaves no holes, and none without a scene. Logs a table of quality and co-adaptation
+    before and after, and says so if the photographs are fitted worse, or the model does not belong to the scene.
+    Returns the evaluations by row of the table.
 
     ``where`` is the model's scene, or an orbit around it; opacities are written plain. ``anyway`` cleans a model that
     was trained with dropout, too, which made all measured ones worse. The rest is as in `score_ply`.

@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 def load_run_model(
     run: Path, device: str = "cpu", *, regularizer: str | None = None, trust: Collection[str] = ()
 ) -> tuple[TrainedModel, Scene]:
-    """Return a run's model at its last checkpoint, and its scene; logs where that is if the training is not finished.
+    """Return a run's model at its last checkpoint, and its scene; logs its step if the training is not finished.
 
     With ``regularizer``, such as "noise(0.8, scale=True)" for a run with "noise(0.8)", the model is treated as if it
     had been trained with that. ``trust`` is as for `load_run`.
@@ -72,6 +72,7 @@ def measure(
     Raises:
         ValueError: if ``out`` holds files of these names that are not from here.
     """
+    # A folder with an earlier measurement is ours; in any other, files of these names are somebody else's.
     if not ((out / EVALUATION).exists() or (out / PARTIAL).exists()):
         check_output(out, None, ("evaluation.md", VIEWS))
     partial = out / PARTIAL
@@ -102,6 +103,7 @@ def _remove_other_pictures(folder: Path, views: Mapping[str, Sequence[Viewpoint]
     """Remove the pictures of an earlier measurement at other views, which have no scores beside them."""
     named = {split: file_names([view.name for view in group]) for split, group in views.items()}
     shown = {folder / split / f"{name}{end}.png" for split, of in named.items() for name in of for end in ("", PANEL)}
+    # Only pictures that this package has written: the folder is the user's.
     for path in {*folder.glob("*/*.png")} - shown:
         if is_own_png(path):
             path.unlink()

@@ -234,7 +234,7 @@ def scaled(gaussians: Gaussians, factor: float) -> Gaussians:
 
 
 def log_other_frame(result: Evaluation, scene: Scene, ply: Path) -> None:
-    """Log it if a model fits no training view as well as the mean color of the pixels of its photograph that count."""
+    """Log it if at every training view one color, the mean of the pixels that count, fits better than the model."""
 
     def of_mean(view: View) -> float:
         pixels = counted(view.image, view.mask)[:, None]
@@ -249,7 +249,7 @@ def log_other_frame(result: Evaluation, scene: Scene, ply: Path) -> None:
 
 
 def _other_size(ply: Path, scene: Scene) -> list[str]:
-    """Return a note if the run that a PLY lies in drew its training views larger or smaller than those of the scene."""
+    """Return a note if the PLY lies in a run whose training views were larger or smaller than those of the scene."""
     for view, name in zip(scene.train, file_names([view.name for view in scene.train]), strict=True):
         picture = ply.parent / VIEWS / "train" / f"{name}.png"
         if picture.is_file() and is_own_png(picture):

@@ -66,7 +66,7 @@ class Monitoring:
     """What is measured and saved while a model trains; it does not affect what is trained.
 
     Args:
-        every: steps between measurements of CA and PSNR, which also takes place after the last step; 0 for none.
+        every: steps between measurements of CA and PSNR, which also take place after the last step; 0 for none.
         protocol: whether to log the paper's CA of five renders in the place of the exact score of all tables.
         pictures: whether each measurement also logs the ``details`` of `CAMonitor` (see `training_snapshot`).
         checkpoint_every: steps between checkpoints, the most that a dead worker costs.
@@ -85,8 +85,8 @@ class Monitoring:
     def __post_init__(self) -> None:
         if self.every < 0 or self.checkpoint_every < 1:
             raise ValueError(
-                f"expected monitor_every of at least 0, for no measurements, and checkpoint_every of at least 1, got "
-                f"{self.every} and {self.checkpoint_every}."
+                f"monitor_every must be at least 0 (0: never) and checkpoint_every at least 1, got {self.every} and "
+                f"{self.checkpoint_every}."
             )
 
 

@@ -57,7 +57,7 @@ def warm_up() -> tuple[str, ...]:
 def step_seconds(width: int, height: int, device: str = "cpu") -> float:
     """Time a training step on this machine as it is now: photographs of this size, one Gaussian for ten pixels.
 
-    After `warm_up`, else what is compiled counts.
+    Call `warm_up` first, or the time includes compilation.
     """
     scene = synthetic_scene(width=40, height=30, points=max(10, width * height // 10))
     views = tuple(

@@ -201,10 +201,10 @@ def _kept(views: Sequence[View], guide: PointCloud) -> PointCloud:
 
 
 def source_views(cameras: Sequence[Camera], number: int, depth: float) -> list[int]:
-    """Return the up to two cameras best suited to match what one of them sees at a depth, the best first.
+    """Return the cameras that match best what one of them sees at a depth: up to two, the best first.
 
-    They see at least a quarter of it, from directions 0.5 to 60 degrees apart, best 12: nearer ones measure depth
-    poorly, and from further away surfaces look different.
+    Each sees at least a quarter of it, from a direction 0.5 to 60 degrees away, at best 12: closer directions measure
+    depth poorly, and from further away surfaces look different.
     """
     points = _grid(cameras[number], torch.tensor([depth]))[0]
     worth = []

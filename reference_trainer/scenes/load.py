@@ -71,6 +71,7 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
     capture = find_reader(root, options.format)(root, options)
     train, test = _split(root, capture, options)
     trained = [frame.name for frame in train]
+    # Initial points must come from no photograph that is not trained on, whether it is tested or not.
     held_out = {frame.name for frame in [*capture.frames, *(capture.test or [])]} - set(trained)
     generator = torch.Generator().manual_seed(seed)
     start = None

@@ -112,8 +112,10 @@ def _idr_camera(world: NDArray[np.float64], width: int, height: int) -> Camera:
     """Decompose K [R | t]: the RQ decomposition of K R, by the QR decomposition of its inverse."""
     if world.shape not in ((4, 4), (3, 4)):
         raise ValueError(f"expected shape (4, 4), got {world.shape}.")
+    # K [R | t] is the same camera times any factor; this sign makes det R = 1.
     projection = world[:3] * np.sign(np.linalg.det(world[:3, :3]))
     turned, upper = np.linalg.qr(np.linalg.inv(projection[:, :3]))
+    # A QR decomposition is unique up to signs: a camera's K has a positive diagonal.
     signs = np.sign(np.diag(upper))
     intrinsics, rotation = np.linalg.inv(upper) * signs, signs[:, None] * turned.T
     pose = np.eye(4)
@@ -129,6 +131,7 @@ def _sphere_bounds(camera: Camera, sphere: NDArray[np.float64]) -> tuple[float, 
     """Return the nearest and farthest depth of the sphere around the object, None if it lies behind the camera."""
     center, radius = torch.from_numpy(sphere[:3, 3].copy()), float(abs(sphere[0, 0]))
     depth = float(camera.forward @ (center - camera.position))
+    # A camera inside the sphere sees things at any depth: the near bound stays positive.
     return (max(depth - radius, depth / 10), depth + radius) if depth > 0 else None
 
 
@@ -245,6 +248,7 @@ def _npz_points(path: Path, arrays: Arrays, frames: Sequence[Frame]) -> PointClo
         raise ValueError(f"{path}: points must have shape (..., 3), got {found.shape}.")
     positions = found.reshape(-1, 3)
     colors = np.full(positions.shape, 0.5)
+    # Backwards, so that the first name wins if several fit.
     for name in [name for name in COLORS if name in arrays][::-1]:
         given = arrays[name]
         given = np.moveaxis(given, 1, -1) if given.ndim == 4 and given.shape[1] == 3 else given

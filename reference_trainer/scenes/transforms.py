@@ -54,7 +54,7 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
             raise FileNotFoundError(f"{path} names {len(missing)} images that are not there, such as {missing[:3]}.")
         back: NDArray[np.float64] = np.linalg.inv(_applied(content)).astype(np.float64)
         frames = [_frame(path, file, content | entry, back) for file, entry in zip(files, entries, strict=True)]
-    except FileNotFoundError:
+    except FileNotFoundError:  # an OSError too, but no fault of this file's content
         raise
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, OSError) as error:
         reason = f"no entry {error}" if isinstance(error, KeyError) else str(error)
@@ -129,6 +129,7 @@ def _world_to_camera(entry: dict[str, Any], back: NDArray[np.float64]) -> torch.
         )
     matrix = back @ matrix
     try:
+        # The columns are the camera's axes in the world: OpenGL's up and back become OpenCV's down and forward.
         return view_matrix((matrix[:3, :3] * [1, -1, -1]).T, matrix[:3, 3])
     except ValueError as error:
         raise ValueError(f"transform_matrix of {entry['file_path']}: {error}") from error
@@ -154,6 +155,7 @@ def _read_transforms(root: Path, options: SceneOptions) -> Capture:
     path = root / "transforms.json"
     frames, content = read_transforms(path, options.images), read_json(path)
     points, split = _points(path, content, frames, options), "transforms" if "train_filenames" in content else "llff"
+    # Split rules count photographs by name; the file may list them in any order.
     return Capture(sorted(frames, key=lambda frame: frame.name), points=points, split=split)
 
 

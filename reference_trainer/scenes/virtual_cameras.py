@@ -101,9 +101,11 @@ def orbit_views(
         )
     sphere = bounding_sphere(means, opacities)
     center, half_angle = sphere.center, math.atan(fill * math.tan(0.5 * FIELD_OF_VIEW))
+    # At this distance the cone of view touches the sphere; the tangent in place of the sine would cut it.
     distance = sphere.radius / math.sin(half_angle)
     focal = 0.5 * min(width, height) / math.tan(0.5 * FIELD_OF_VIEW)
     level, lift = distance * math.cos(ELEVATION), distance * math.sin(ELEVATION)
+    # With a camera at both ends, a full circle would have its first one twice.
     full = arc > 2 * math.pi * (1 - 1e-9)
     start, step = (0.0, arc / count) if full else (-0.5 * arc if count > 1 else 0.0, arc / max(1, count - 1))
     axes = _axes(world).to(center)
@@ -204,6 +206,7 @@ def pseudo_cameras(scene: Scene) -> Callable[[torch.Generator], Camera]:
     rotations = torch.stack([camera.world_to_camera[:3, :3].double() for camera in cameras])
     positions = torch.stack([camera.position.double() for camera in cameras])
     down, forward = rotations[:, 1].mean(0), rotations[:, 2].mean(0)
+    # The more unit vectors disagree, the shorter is their mean.
     if forward.norm() < 0.5:
         raise ValueError(
             f"pseudo views need training cameras that look to one side; the mean of their axes is {forward.norm():.2f} "
@@ -271,6 +274,8 @@ def camera_between(first: Camera, second: Camera, along: float, path: CameraPath
     """
     from kornia.geometry.liegroup import Se3
 
+    # The screw motion exp(s log(end start^-1)) start turns along the great arc at a steady rate. A line keeps that
+    # rotation R and has its position p by t = -R p.
     start, end = (Se3.from_matrix(camera.world_to_camera.double()) for camera in (first, second))
     pose = (Se3.exp(along * (end * start.inverse()).log()) * start).matrix()
     if path == "line":
@@ -342,6 +347,7 @@ def measured_views(scene: Scene) -> dict[str, Sequence[Viewpoint]]:
     if len(cameras) < 2:
         return {"train": scene.train}
     nearest = nearest_neighbors(torch.stack([camera.position for camera in cameras]), 1)[1][:, 0].tolist()
+    # Two cameras that are nearest to each other have one middle, but each its own continuation.
     pairs = sorted({(min(pair), max(pair)) for pair in enumerate(nearest)})
     new = {
         "between": [camera_between(cameras[i], cameras[j], 0.5) for i, j in pairs],
@@ -378,6 +384,7 @@ def unseen_views(scene: Scene) -> list[Viewpoint]:
     ways += [
         (f"beyond {names[i]}, away from {names[j]}", i, j, -along) for i, j in pairs for along in (1 / 3, 2 / 3, 1.0)
     ]
+    # Evenly through the list, so that of a hundred photographs no region is left out.
     chosen = torch.linspace(0, len(ways) - 1, min(len(ways), MOST_UNSEEN)).round().int().tolist()
     some = [ways[number] for number in chosen]
     return [Viewpoint(name, camera_between(cameras[i], cameras[j], along, "arc")) for name, i, j, along in some]

@@ -110,6 +110,7 @@ def error_runtime(model: TrainedModel, view: Viewpoint, *, max_samples: int = 10
     Raises:
         ValueError: if no pixel is covered, or nothing in the region varies.
     """
+    # The same float32 parameters, computed with in float64: what is left is the error of the arithmetic.
     double = replace(model, gaussians=model.gaussians.map(Tensor.double), background=model.background.double())
     multiplier = Multiplier.dropout(DROP_RATE)
     opacities, precise = model.gaussians.opacities, double.gaussians.opacities
@@ -143,6 +144,7 @@ def error_runtime(model: TrainedModel, view: Viewpoint, *, max_samples: int = 10
         **exact_calls,
         DOUBLE: lambda: double.moments(precise, view, multiplier).variance,
     }
+    # This is also the untimed round, in which engines compile and caches fill.
     maps = {name: call() for name, call in calls.items()}
     seconds = in_turns(calls, ROUNDS, functools.partial(now, device))
     of_seeds = [
@@ -183,10 +185,12 @@ def _monte_carlo(
     count, spent, target = 0, 0.0, 2
     while target <= max_samples:
         start = now(device)
+        # One pass serves all K: the first renders of a larger K are those of the smaller ones.
         while count < target:
             keep = draw_keep_mask(len(model.gaussians), DROP_RATE, generator=generator, device=device)
             image = model.render(apply_dropout(opacities, keep), view)[0].double()
             count += 1
+            # Welford's recursion: a sum of squares less the square of a sum would cancel.
             deviation = image - mean
             mean = mean + deviation / count
             scatter = scatter + deviation * (image - mean)
@@ -305,6 +309,7 @@ def _panel(axes: Any, record: Record) -> None:
                     linewidth=1,
                     capsize=2,
                 )
+    # A line, not a point: the error of the reference is 0, for which a logarithmic axis has no place.
     precise = statistics.median(entries_of(record, DOUBLE)[0]["seconds"])
     axes.axvline(precise, color="0.3", linestyle=":", label=f"{DOUBLE} (reference)")
     axes.set(xscale="log", yscale="log", xlabel="wall-clock time, s")

@@ -146,6 +146,7 @@ def _decisive(settings: Any) -> Any:
     """Return settings for `fingerprint`, with the size and modification time of files."""
     if isinstance(settings, Path):
         state = settings.stat()
+        # Not the content: checkpoints are large, and a training that goes on changes both.
         return [str(settings.resolve()), state.st_size, state.st_mtime_ns]
     if isinstance(settings, dict):
         return {name: _decisive(value) for name, value in settings.items()}
@@ -163,7 +164,7 @@ def in_turns(calls: Mapping[str, Callable[[], object]], repeats: int, clock: Clo
         3
     """
     seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for call in calls.values():
+    for call in calls.values():  # untimed: compilation, caches, the first touch of memory
         call()
     for _ in range(repeats):
         for name, call in calls.items():

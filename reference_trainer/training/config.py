@@ -177,6 +177,7 @@ def saved_config(values: Any, where: str) -> TrainConfig:
     return settings_from(TrainConfig, values, where)
 
 
+# Names of versions before 0.2, which files keep: read from files, refused as arguments.
 _RENAMED_RENDERERS = {"torch": "builtin"}
 _RENAMED_SETTINGS = {"fields": "models"}
 

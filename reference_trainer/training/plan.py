@@ -106,6 +106,7 @@ def make_plan(
 
 def _kept(config: TrainConfig, given: Collection[str]) -> set[str]:
     """Fields that the plan must not touch."""
+    # A value at its default may have been asked for: `given` tells, the value cannot.
     default = vars(TrainConfig())
     return {*given, *(name for name, value in vars(config).items() if value != default[name])}
 

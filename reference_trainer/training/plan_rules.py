@@ -134,8 +134,11 @@ def dropout(scene: Scene, config: TrainConfig) -> PlanItem:
     if far:
         gains, where = [*FAR_APART_GAINS.values()], f"where views were further than {FAR_APART} degrees apart"
     else:
+        # Nearest in ratio: 2 and 3 views differ more than 24 and 25.
         nearest = min(DROPOUT_GAINS, key=lambda n: abs(math.log(n / count)))
         gains, where = [*DROPOUT_GAINS[nearest].values()], f"with {nearest} views"
+    # Far apart, dropout alone gained little: there the whole setting is recommended, up to as many views as it was
+    # measured with.
     pays = count <= FEW if far else sorted(gains)[len(gains) // 2] >= WORTH
     reason = f"{views}; {where} dropout changed PSNR by {_range(gains)} (means of 3 seeds)"
     if pays:
@@ -295,4 +298,5 @@ def _degrees_apart(scene: Scene) -> float:
     """The median over the training views of the angle to the nearest other one, seen from the middle of the points."""
     middle = scene.points.positions.median(0).values
     to = torch.nn.functional.normalize(torch.stack([view.camera.position for view in scene.train]) - middle, dim=1)
+    # The diagonal, each view with itself, must not be the nearest.
     return float((to @ to.T).fill_diagonal_(-1.0).amax(1).clamp(-1, 1).arccos().rad2deg().median())

@@ -154,6 +154,7 @@ def with_steps(expression: str, times: float) -> str:
     """
     if times == 1:
         return expression
+    # Not within a name, such as my_loss200, nor after a decimal point, as in 0.125.
     return re.sub(r"(?<![\w.])[1-9][\d_]{2,}(?![\w.])", lambda at: str(round(times * int(at[0]))), expression)
 
 
@@ -186,6 +187,7 @@ def with_recipe(name: str, **changes: object) -> TrainConfig:
     # Through TrainConfig, which refuses a number of iterations that is none.
     times = TrainConfig(iterations=changes.get("iterations", config.iterations)).iterations / config.iterations  # type: ignore[arg-type]
     scaled: dict[str, object] = {
+        # At least 1 for sh_every: 0 would mean all bands from the first step on, not soon.
         mark: max(int(mark == "sh_every"), round(times * at))
         for mark in _MARKS
         if (at := getattr(config, mark)) is not None

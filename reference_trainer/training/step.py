@@ -23,7 +23,7 @@ __all__ = ["Step", "read_later"]
 
 
 def read_later(x: Tensor) -> Callable[[], float]:
-    """Begin to read a number, and return the function that waits for it, but not for what is begun in between.
+    """Start to copy a number to the host; return a function that waits for the copy, not for work launched after it.
 
     Example:
         >>> read_later(torch.tensor(0.5))()

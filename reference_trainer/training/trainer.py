@@ -213,6 +213,7 @@ class Trainer:
                 replace a good one.
             OSError: if it cannot be written; what was there before is kept.
         """
+        # The first model's entries stand at the top, as in files of a single model.
         first, *others = [model.state_dict() for model in self.models]
         moved = [x for model in (first, *others) for x in (model["gaussians"], *model["moments"].values())]
         if not all(bool(x.isfinite().all()) for tensors in moved for x in tensors.values()):

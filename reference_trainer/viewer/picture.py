@@ -57,9 +57,9 @@ class Picture(NamedTuple):
 class ViewerModel:
     """A model to show; what successive pictures share is computed once.
 
-    Its heat is measured at ``views``, which are on its device; the unit of the colors is the mean heat of ``beside``,
-    so that two models can be compared, or its own. ``train`` are the photographs that it was trained on, for the
-    expected error and the support.
+    Its heat is measured at ``views``, which are on its device. The unit of the heat's colors is the mean heat of
+    ``beside``, so that two models can be compared; without it, the model's own. ``train`` are the photographs that it
+    was trained on, for the expected error and the support.
 
     Example:
         >>> from reference_trainer.model.gaussians import Gaussians

@@ -44,7 +44,7 @@ FEWEST, MOST = 10_000, 1_000_000
 TRAINING_SHARE = 0.1
 """Fraction of a training's time that showing its new states may take; moving the camera takes more."""
 MOVIE_PIXELS, MOVIE_FRAMES = 400_000, 40
-"""Of a recorded flight: most pixels of a picture of a model, and pictures from one camera to the next."""
+"""Of a recorded flight: most pixels of a model's picture, and the number of pictures from one camera to the next."""
 BOTH = "side by side"
 
 
@@ -111,7 +111,10 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             self._server.stop()
 
     def show(self, model: TrainedModel, views: Mapping[str, Sequence[Viewpoint]], name: str = "") -> None:
-        """Show a model from now on; one of another name beside the first, whose views are the cameras to jump to."""
+        """Show a model from now on.
+
+        A model of another name is shown beside the first, whose views remain the cameras to jump to.
+        """
         device = model.gaussians.means.device
         flat = [view.to(device) for group in views.values() for view in group]
         train = [view for view in views.get("train", ()) if isinstance(view, View)]  # test views must not tell
@@ -149,7 +152,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             self._next_model = end + (end - start) * (1 / TRAINING_SHARE - 1)
 
     def update(self) -> float | None:
-        """Render for every page that is due; return the seconds until the next one is, None if that takes a change."""
+        """Render for every page that is due; return the seconds until the next is, None if that takes a change."""
         waits = []
         for window in list(self._windows.values()):
             still = time.monotonic() - window.moved
@@ -292,7 +295,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
             self._status.content = f"path: {cameras}; a flight needs 2 or more, 2 s from each to the next"
 
     def _hide_nearest_frustum(self, position: Any, *, beside: bool) -> None:
-        """Hide the frustum that a page looks out of, which would lie across its picture, and all beside each other."""
+        """Hide the frustum that a page looks out of, which would lie across its picture; all of them if ``beside``."""
         for place, frustum in self._frusta:
             visible = not beside and float(np.linalg.norm(place - np.asarray(position))) > 2 * frustum.scale
             if frustum.visible != visible:
@@ -385,10 +388,10 @@ def _pose(camera: Camera, distance: float, level: torch.Tensor | None = None) ->
 
 
 def _level(cameras: Sequence[Camera]) -> torch.Tensor:
-    """Return the direction (3,) that is up if cameras were held level: across their x axes, near their mean."""
+    """Return the direction (3,) that is up if cameras were held level: perpendicular to their x axes."""
     axes = torch.stack([camera.world_to_camera[:3, :3] for camera in cameras])
     right, up = axes[:, 0], -axes[:, 1].mean(0)
-    weak = 0.01 * len(cameras)  # of the mean, which decides what parallel axes leave open
+    weak = 0.01 * len(cameras)  # of the mean direction that is up, which decides where parallel axes leave it open
     return torch.nn.functional.normalize(torch.linalg.solve(right.T @ right + weak * torch.eye(3), weak * up), dim=0)
 
 

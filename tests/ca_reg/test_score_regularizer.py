@@ -119,7 +119,7 @@ def test_what_a_score_cannot_render_is_refused():
     with pytest.raises(TypeError, match=r"forward of Dropout takes no argument generator.* Add generator=None to it"):
         score(OPACITY, None)
     score = CAScore(render, regularizer=Chain(GaussianDropout(0.5), ScaleNoise(0.5)), threshold=0.1)
-    with pytest.raises(ValueError, match="Chain changes more than opacities"):
+    with pytest.raises(ValueError, match="Chain changes other parameters than opacities"):
         score(Params(OPACITY, scales=torch.ones(3, 3)), None)
     for rates in ({"p": torch.tensor([0.1, 0.2, 0.3])}, {"drop_rate": torch.tensor([0.1, 0.2, 0.3])}):
         with pytest.raises(TypeError, match=f"{next(iter(rates))} must be a real number, got Tensor"):

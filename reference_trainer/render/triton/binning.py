@@ -50,6 +50,7 @@ def list_tiles(
     l22 = tl.load(factors + 3 * i + 2, mask=real, other=1.0)
     xx, xy = tl.load(covariances + 3 * i, mask=real, other=1.0), tl.load(covariances + 3 * i + 1, mask=real, other=0.0)
     yy = tl.load(covariances + 3 * i + 2, mask=real, other=1.0)
+    # alpha = o exp(-d^2 / 2) falls to MIN_ALPHA where d^2 = 2 ln(o / MIN_ALPHA). The center of pixel p is at p + 0.5.
     limit = 2 * tl.maximum(tl.log(tl.load(opacities + i, mask=real, other=1.0) / _MIN_ALPHA), 0.0)
     reach, tip = tl.sqrt(limit * yy), xy * tl.sqrt(limit / xx)
     top = tl.minimum(tl.maximum(tl.ceil(y - reach - 0.5), 0.0), height.to(tl.float32)).to(tl.int32)
@@ -93,6 +94,7 @@ def bin_gaussians(projected: Projected, width: int, height: int, check: Callable
     _, projection, opacities, _, numbers = projected
     columns, count = -(-width // TILE), len(opacities)
     tiles = columns * -(-height // TILE)
+    # Signed: the edges below go up to the number of tiles itself.
     short = torch.int16 if tiles < 2**15 else torch.int32
     order = torch.argsort(projection.depths, stable=True)
     shapes = (

@@ -114,6 +114,9 @@ def composite_backward(
                 if DEPTH:
                     along += u_d * tl.load(row + 9)
                 beyond -= weight * along
+                # raw times the gradient of alpha is that of ln alpha, from which `geometry_sums` goes on. raw stands
+                # for the clamped alpha too, which passes gradients, and 1 - clamped is at least 1 - MAX_ALPHA: no
+                # division by 0. The splat at which a pixel terminates has no weight there, and so no gradient.
                 slope = tl.where(t > 0, raw * (front * along - beyond / (1 - clamped)), 0.0)  # of ln alpha
                 if ABSOLUTE:
                     _dx, _dy, w1, w2, l11, l21, l22 = geometry
@@ -218,6 +221,7 @@ def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tu
     lists, count = Lists.of(splats.lists), len(opacities)
     highest = opacities.amax(0)
     table = tiles.make_table(splats._replace(opacities=highest))
+    # What no mask shows has a faint row in the table and is skipped; its ratios, 0 / 0 without the clamp, are not read.
     ratios = (opacities / highest.clamp_min(MIN_ALPHA)).T.contiguous()
     images = table.new_empty(count, 3, lists.height, lists.width)
     alphas = table.new_empty(count, lists.height, lists.width)

@@ -175,6 +175,8 @@ def moments_backward(
                     c0, c1, c2 = u0 * expected + twice * w0, u1 * expected + twice * w1, u2 * expected + twice * w2
                     u0, u1, u2, u_a = u0 - c0, u1 - c1, u2 - c2, u_a * passed
                     front *= shrink
+                    # expected = m alpha and spread = v alpha^2: to_alpha = m to_expected + 2 v alpha to_spread, and raw
+                    # times it is the gradient of ln alpha, as the clamp passes gradients. m and v take the rest.
                     slope = raw * (2 * tl.load(row + 10) * to_spread * alpha + to_expected * tl.load(row + 9))
                     g0, g1, g2, g3, g4, g5 = geometry_sums(slope, geometry, log_opacity)
                     to_r, to_g, to_b, share = tl.sum(c0), tl.sum(c1), tl.sum(c2), tl.sum(of_spread * spread)
@@ -236,6 +238,7 @@ def moments(splats: Splats, multiplier: Tensor, background: Tensor) -> MomentIma
 def shares_of(table: Tensor, lists: Lists, background: Tensor, weights: Tensor) -> Tensor:
     """Return every row's share of the variance, mean over RGB, for weights of the pixels (H, W); (M,), float64."""
     nothing = weights.new_zeros(3, *weights.shape)
+    # Gradients as of a loss that is the weighted variance alone, mean over RGB; none of mean and alpha.
     images = torch.cat([nothing, (weights / 3).expand_as(nothing), nothing[:1], background])
     return _gradients(table, lists, images)[0][:, 11].double()
 

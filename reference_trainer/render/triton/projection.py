@@ -141,6 +141,8 @@ def _basis(x, y, z):
 @triton.jit
 def _basis_slopes(x, y, z):
     """Return the derivatives of the harmonics in x, y and z."""
+    # Term by term the derivatives of the polynomials in `_basis`, in all of space: D (2 zz - xx - yy), for example, has
+    # -2 D x, -2 D y and 4 D z. `project_backward` removes the part along the direction, which would leave the sphere.
     xx, yy, zz, no = x * x, y * y, z * z, 0 * x
     in_x = (
         no, no, no, no - _B, y * _C, no, x * (-2 * _D), z * -_C, x * _C, x * y * (-6 * _E), y * z * _F,
@@ -186,6 +188,7 @@ def find_visible(means, opacities, view, visible, numbers, count, BLOCK: tl.cons
     tl.store(visible + i, ((z > _NEAR_PLANE) & (opacity >= _MIN_ALPHA)).to(tl.uint8), mask=real)
     _add_unless_finite(numbers, z + 0 * opacity)
     if tl.program_id(0) == 0:
+        # The pose travels with the sums that the processor waits for: to read it on its own would be another wait.
         j = tl.arange(0, 16)
         tl.store(numbers + 2 + j, tl.load(view + j).to(tl.float64))
 
@@ -276,6 +279,9 @@ def project_backward(
     m0 = _plus(_times(row_x[0], vx), row_y[0], vy)  # the gradient of the rotation matrix, by rows
     m1 = _plus(_times(row_x[1], vx), row_y[1], vy)
     m2 = _plus(_times(row_x[2], vx), row_y[2], vy)
+    # The matrix holds w in differences of mirrored entries, such as 2 (yz + wx) and 2 (yz - wx), and products of two
+    # other components in their sums: hence the differences a and the sums b of mirrored gradients. The diagonal has
+    # -2 xx in the entries of the two other axes, and so on.
     qw, qx, qy, qz = unit
     a12, a20, a01 = m2[1] - m1[2], m0[2] - m2[0], m1[0] - m0[1]
     b12, b20, b01 = m2[1] + m1[2], m0[2] + m2[0], m1[0] + m0[1]
@@ -343,7 +349,9 @@ class _Project(torch.autograd.Function):
             *outputs, numbers, *ctx.size, camera.cx, camera.cy, *ctx.limits, **ctx.constants,
         )  # fmt: skip
         ctx.save_for_backward(*given, view, outputs[4])
+        # The covariances only decide on tiles and radii, which have no gradient.
         ctx.mark_non_differentiable(outputs[2])
+        # Gradients that nobody asked for stay None: the kernel then leaves the depths out instead of adding zeros.
         ctx.set_materialize_grads(False)
         return outputs
 
@@ -356,6 +364,7 @@ class _Project(torch.autograd.Function):
             _rows(colors.new_zeros(len(colors), *shape) if x is None else x)
             for x, shape in zip((*gradients[:2], *gradients[4:]), ((2,), (3,), (3,), ()), strict=True)
         ]
+        # A kernel takes an address in every place: without depths another, which it does not read.
         upstream.insert(2, _rows(gradients[3]) if depths else upstream[-1])
         # One fill for all of them, and none if everything is written. Aligned alike whatever their sizes: kernels are
         # compiled for the alignment of what they are given.

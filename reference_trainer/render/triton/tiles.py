@@ -127,6 +127,7 @@ def sum_rows(rows: Tensor, each: bool, lists: Lists, count: int) -> Tensor:
     """Return the gradients of ``count`` splats, (count, 16)."""
     if not each:
         return rows
+    # Stable, or entries of one splat would be added up in any order again.
     gaussians, order = torch.sort(lists.gaussians, stable=True)
     ends = torch.arange(count + 1, dtype=gaussians.dtype, device=rows.device)
     return torch.segment_reduce(rows[order], "sum", offsets=torch.searchsorted(gaussians, ends), axis=0)
@@ -206,6 +207,7 @@ def add_row(rows, row, e, i, COLUMNS: tl.constexpr, EACH: tl.constexpr):
 
     Relaxed: additions need no order among other memory accesses, and the fences of the default would wait for each.
     """
+    # In 64 bits, as 2^27 entries have 2^31 numbers.
     column = tl.arange(0, ROW).to(tl.int64)
     if EACH:
         tl.store(rows + (0 * column + e) * ROW + column, row, mask=column < COLUMNS)

@@ -65,6 +65,7 @@ class Case:
 
 def single(family: str, name: str, probe: Callable[[], Probe], *, refused: str = "", draws: bool = True) -> Case:
     """Return a case without a scale, which must be right, or may be refused if ``refused`` names by what."""
+    # The only magnitude is 1: with 0 it lies beyond what must be right.
     until = 0.0 if refused else math.inf
     return Case(family, name, lambda _: probe(), until=until, beyond="refused", note=refused, draws=draws)
 
@@ -195,6 +196,7 @@ def _on_border() -> Probe:
     """Put Gaussians on the four edges and the four corners of the image."""
     camera = Camera(torch.eye(4, dtype=torch.float64), 32.0, 32.0, 16.0, 12.0, 32, 24)
     pixels = [(0, 0), (32, 0), (0, 24), (32, 24), (16, 0), (16, 24), (0, 12), (32, 12)]
+    # Different depths, in steps that float32 represents exactly: their order is not what this case is about.
     depths = 2.0 + 0.125 * torch.arange(8, dtype=torch.float64)
     slopes = (torch.tensor(pixels, dtype=torch.float64) - torch.tensor([16.0, 12.0])) / 32.0
     means = torch.cat([slopes * depths[:, None], depths[:, None]], dim=1)
@@ -205,6 +207,7 @@ def _beside(pixels: float, sigma: float | None = None) -> Probe:
     """Put a Gaussian outside the image, by default so wide that it still reaches in."""
     camera = camera_of()
     width = pixels if sigma is None else sigma
+    # So many pixels to the right of the border, at depth 3.
     slope = (pixels + camera.width - camera.cx) / camera.fx
     return _replaced(3.0 * torch.tensor([slope, 0.05, 1.0]).double(), 3.0 * width / camera.fx, base_scene())
 
@@ -221,6 +224,7 @@ def _far(factor: float) -> Probe:
 def _offset(offset: float) -> Probe:
     """Shift scene and camera in the world; the reference stays unrounded, because float32's rounding is the subject."""
     scene = base_scene().rounded()
+    # Along no axis, so that all three coordinates are rounded.
     shift = offset * torch.tensor([1.0, -0.7, 0.4], dtype=torch.float64)
     pose = scene.camera.world_to_camera.clone()
     pose[:3, 3] -= pose[:3, :3] @ shift
@@ -231,6 +235,7 @@ def _offset(offset: float) -> Probe:
 def _telephoto(focal: float) -> Probe:
     """Shrink the scene across the optical axis as the focal length grows, so that it fills the image."""
     scene = base_scene(camera=Camera(torch.eye(4, dtype=torch.float64), focal, focal, 15.0, 12.7, 32, 24))
+    # 40 is the focal length of the base scene, which fills the image.
     across = torch.tensor([40.0 / focal, 40.0 / focal, 1.0], dtype=torch.float64)
     means = scene.means * across + torch.tensor([0.0, 0, 3], dtype=torch.float64)
     return of_scene(replace(scene, means=means, scales=scene.scales * min(40.0 / focal, 4.0)))
@@ -337,6 +342,7 @@ def _copies(count: float) -> Probe:
     """Draw copies of one Gaussian in different colors: rounding must not change the order of equal depths."""
     n = int(count)
     scene = base_scene(n)
+    # All but the colors, which reveal the order of equal depths.
     same = {name: getattr(scene, name)[:1].expand(n, -1) for name in ("means", "quaternions", "scales")}
     return of_scene(replace(scene, **same, opacities=torch.full((n,), 0.3, dtype=torch.float64)))
 
@@ -364,6 +370,7 @@ def _masked(keep: Tensor) -> Probe:
 def _noise(sigma: float) -> Probe:
     """Set sigma of the draw, and of the clamped noise's moments and mean opacity for faint to opaque Gaussians."""
     scene = base_scene().rounded()
+    # Over many decades near 0, and dense near 1, where the clamp cuts off up to half of the noise.
     grid = torch.cat([torch.logspace(-8, -1, 8), torch.linspace(0.2, 1.0, 9), 1 - torch.logspace(-7, -2, 6)])
 
     def compute(dtype: torch.dtype) -> Quantities:
@@ -383,6 +390,7 @@ def _renders(count: float) -> Probe:
     opacity = torch.linspace(0.3, 0.9, 10)
 
     def score(dtype: torch.dtype) -> Quantities:
+        # A plain sum of squares would lose the variance in float32: the mean is 100, the standard deviation below 1.
         colors = 100.0 + torch.linspace(0, 1, 10, dtype=dtype)
 
         def render_fn(opacity: Tensor, view: None) -> tuple[Tensor, Tensor]:

@@ -58,6 +58,7 @@ def judge(case: Case) -> Record:
         if failed > 0:
             good = points[failed - 1]["magnitude"]
             for _ in range(_HALVINGS):
+                # The geometric mean, as magnitudes go by powers of ten.
                 points.append(_point(case, math.sqrt(good * onset)))
                 middle = points[-1]["magnitude"]
                 good, onset = (middle, onset) if points[-1]["status"] == "ok" else (good, middle)
@@ -93,6 +94,7 @@ def relative_error(measured: Tensor, reference: Tensor) -> float:
     if measured.shape != reference.shape:
         raise ValueError(f"shapes differ: {tuple(measured.shape)} and {tuple(reference.shape)}.")
     measured, reference = measured.detach().double(), reference.detach().double()
+    # nan in both is agreement: a scene in which nothing is visible has no score.
     defined = ~(measured.isnan() & reference.isnan())
     measured, reference = measured[defined], reference[defined]
     if not bool(measured.isfinite().all()):
@@ -106,6 +108,7 @@ def _point(case: Case, magnitude: float) -> Record:
     try:
         measured = probe.measured()
     except (ValueError, TypeError) as error:
+        # What the package raises on purpose; all other errors come from somewhere below and name no mistake.
         status, message = "refused", f"{type(error).__name__}: {error}"
     except (RuntimeError, ArithmeticError, LookupError, AssertionError, MemoryError) as error:
         status, message = "crash", f"{type(error).__name__}: {error}"
@@ -113,6 +116,7 @@ def _point(case: Case, magnitude: float) -> Record:
         reference = probe.reference()
         errors = {name: relative_error(x, reference[name]) for name, x in measured.items()}
         allowed = {name: GRADIENT_TOLERANCE if name.startswith("d ") else VALUE_TOLERANCE for name in errors}
+        # Not `error > allowed`, which is false for nan.
         wrong = [name for name, error in errors.items() if not error <= allowed[name]]
         if wrong:
             status = "not finite" if math.inf in map(errors.get, wrong) else "inexact"
@@ -157,6 +161,7 @@ def judge_with(number: int, engine: str | None) -> Record:
     return {"engine": engine, "seconds": perf_counter() - start, **record}
 
 
+# One case at a time is enough: its engines come one after the other.
 @lru_cache(maxsize=1)
 def _with_one_reference(case: Case) -> Case:
     """Return the case with cached references: these are in float64 and do not depend on the engine."""
@@ -249,6 +254,7 @@ def _draw(records: Records, figure: Any) -> None:
     table = np.full((len(cases), len(SCENE_QUANTITIES)), math.nan)
     for i, of in enumerate(cases.values()):
         for name, error in (pair for record in of for pair in _worst_errors(record).items()):
+            # fmax ignores nan, which stands for what has not been measured.
             table[i, SCENE_QUANTITIES.index(name)] = np.fmax(table[i, SCENE_QUANTITIES.index(name)], max(error, _FLOOR))
     figure.set_size_inches(WIDTH, max(4.0, 0.19 * len(cases) + 1.8))
     axes = figure.subplots()

@@ -56,7 +56,8 @@ def _error(image, target, variance, place, inside, EXPECTED: tl.constexpr):
     x, y = tl.load(image + place, mask=inside, other=0.0), tl.load(target + place, mask=inside, other=0.0)
     d = x - y
     if EXPECTED:
-        # E = d dE/dd + 2 v dE/dv with z = d / sqrt(2 v): dE/dd = erf(z), dE/dv = exp(-z^2) / sqrt(2 pi v).
+        # E = d dE/dd + 2 v dE/dv with z = d / sqrt(2 v): dE/dd = erf(z), dE/dv = exp(-z^2) / sqrt(2 pi v); why so is
+        # derived in `ca_reg.functional.expected_losses`.
         v = tl.load(variance + place, mask=inside, other=0.0) + _FLOOR
         scale = 1 / tl.sqrt(2 * v)
         z = d * scale
@@ -112,6 +113,7 @@ def compare_pictures(
     b1, b2 = squares + _C1, mean_squares - squares + _C2
     weight = 1 / (b1 * b2)
     ssim = a1 * a2 * weight
+    # The derivatives are derived in `photometric._similarity`.
     to_mean = 2 * weight * (mean_y * (a2 - a1) + ssim * mean_x * (b1 - b2))
     store3(slopes + plane, place, size, inside, to_mean, -weight * ssim * b1, 2 * weight * a1)
     if LOSS:
@@ -146,6 +148,8 @@ def gather_gradients(
     to_squares = _blur(pixels + size, width, y, height, inside)
     to_product = _blur(pixels + 2 * size, width, y, height, inside)
     _e, by_image, by_variance, p, q = _error(image + plane, target + plane, variance + plane, place, inside, EXPECTED)
+    # x itself, x^2 + y^2 (to which the variance was added) and x y were blurred: their derivatives in x are 1, 2 x and
+    # y. SSIM enters the loss as 1 - SSIM, hence the minus below.
     in_image, in_variance = to_mean + 2 * p * to_squares + q * to_product, to_squares
     if LOSS:
         given = tl.load(upstream)

@@ -173,6 +173,8 @@ class _SSIMMap(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, Tensor | None]:
         image, target, slopes = ctx.saved_tensors
         # The window is symmetric and the padding is zero, so the blur is its own transpose.
+        # Blurred slopes are the gradients of the maps x, x^2 + y^2 and x y (and of the variance, which was added to the
+        # second): d(x^2 + y^2)/dx = 2 x, d(x y)/dx = y.
         mean, squares, product = _blur(slopes * gradient)
         to_image = mean.addcmul_(image, squares, value=2).addcmul_(target, product)
         return to_image, None, squares if ctx.needs_input_grad[2] else None
@@ -193,6 +195,9 @@ def _similarity(blurred: Tensor) -> tuple[Tensor, Tensor]:
     b1, b2 = squares + C1, (mean_squares - squares).add_(C2)
     weight = 1 / (b1 * b2)
     result = a1 * a2 * weight
+    # In the blurred x, a1 grows by 2 y and a2 shrinks by it, b1 grows by 2 x and b2 shrinks by it: w 2 y (a2 - a1) from
+    # the numerator, SSIM (2 x / b2 - 2 x / b1) = w SSIM 2 x (b1 - b2) from the denominator, w the weight. The blurred
+    # x^2 + y^2 stands in b2 alone, -SSIM / b2 = -w SSIM b1, and x y, twice, in a2: 2 a1 w.
     to_mean = 2 * weight * (mean_y * (a2 - a1) + result * mean_x * (b1 - b2))
     return result, torch.stack([to_mean, -weight * result * b1, 2 * weight * a1])
 
