@@ -74,12 +74,14 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 1, 
             kernel[grid](*arguments, num_warps=warps, enable_fp_fusion=True, **constants)
 
 
-def over_tiles(kernel: Any, lists: Lists, table: Tensor, *arguments: Any, programs: int = 0, **constants: Any) -> None:
-    """Start a program for every tile, or as many as told; a warp has 64 pixels."""
+def over_tiles(
+    kernel: Any, lists: Lists, table: Tensor, *arguments: Any, programs: int = 0, per_warp: int = 64, **constants: Any
+) -> None:
+    """Start a program for every tile, or as many as told; a warp has 64 pixels, or as many as told."""
     size = lists.width, lists.height, -(-lists.width // lists.tile)
     launch(
         kernel, (programs or lists.tiles,), table, lists.starts, lists.gaussians, *arguments, *size,
-        warps=max(1, lists.tile**2 // 64), STRIDE=table.shape[1], TILE=lists.tile, **constants,
+        warps=max(1, lists.tile**2 // per_warp), STRIDE=table.shape[1], TILE=lists.tile, **constants,
     )  # fmt: skip
 
 
