@@ -87,7 +87,7 @@ def test_triton_without_a_c_compiler_is_as_good_as_none(afresh, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.warns(UserWarning, match="needs a C compiler: install gcc or clang, or name one by CC"):
         assert describe_engine("cuda") == "torch"
-    with pytest.raises(ImportError, match="the engine triton needs .* a C compiler"):
+    with pytest.raises(ImportError, match=r"the engine triton needs .* a C compiler"):
         use_engine("triton")
     engine_module._compiled_engine.cache_clear()
     monkeypatch.setattr(shutil, "which", lambda name: "/usr/bin/clang" if name == "clang" else None)
