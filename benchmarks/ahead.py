@@ -9,7 +9,8 @@ from __future__ import annotations
 import re
 import subprocess
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,13 +45,17 @@ _TYPES |= {f"rate{i}": "fp32" for i in range(6)}
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel with the constants and warps of one of its uses; ``walks`` whether it walks over lists."""
+    """A kernel with the constants and warps of one of its uses; ``walks`` whether it walks over lists.
+
+    ``types`` are those of arguments that differ from use to use.
+    """
 
     label: str
     function: Any
     constants: dict[str, Any]
     warps: int = 1
     walks: bool = True
+    types: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -73,11 +78,11 @@ def _tiled(label: str, function: Any, columns: int, tile: int = 8, warps: int = 
 def _projection(bands: int) -> list[Kernel]:
     constants = {"BANDS": bands, "ROW": max(1, bands), "BLOCK": 128}
     colors = f"degree {round(bands**0.5) - 1}" if bands else "colors"
+    forward, backward = projection.project_forward, projection.project_backward
     return [
-        Kernel(f"project, {colors}", projection.project_forward, constants, 4, walks=False),
-        Kernel(
-            f"project backward, {colors}", projection.project_backward, constants | {"DEPTHS": True}, 4, walks=False
-        ),
+        Kernel(f"project, {colors}", forward, constants, 4, walks=False),
+        Kernel(f"project backward, {colors}", backward, constants | {"DEPTHS": False}, 4, walks=False),
+        Kernel(f"project backward, depth, {colors}", backward, constants | {"DEPTHS": True}, 4, walks=False),
     ]
 
 
@@ -92,12 +97,22 @@ def _photometric(label: str, **constants: Any) -> list[Kernel]:
     ]
 
 
-_DRAWN = {"DEPTH": False, "ABSOLUTE": False, "EACH": False}
+def _carried(label: str, depth: bool, absolute: bool) -> list[Kernel]:
+    """Return the backward pass of a picture, adding in any order and in one."""
+    constants = {"DEPTH": depth, "ABSOLUTE": absolute}
+    return [
+        _tiled(f"{label}{order}", compositing.composite_backward, 9 + depth, **constants, EACH=bool(order))
+        for order in ("", ", in order")
+    ]
+
+
+_LISTING = {"TILE": 8, "GROUP": 32, "LANES": 8}
 KERNELS = [
     Kernel("find visible", projection.find_visible, {"BLOCK": 1024}, 4, walks=False),
     *(kernel for bands in (0, 1, 4, 9, 16) for kernel in _projection(bands)),
-    Kernel("fill table", tiles.fill_table, {"MORE": 2, "BLOCK": 256}, 4, walks=False),
-    Kernel("list tiles", binning.list_tiles, {"TILE": 8, "GROUP": 32, "LANES": 8}, 1, walks=False),
+    *(Kernel(f"fill table, {x} more", tiles.fill_table, {"MORE": x, "BLOCK": 256}, 4, walks=False) for x in (0, 1, 2)),
+    Kernel("list tiles", binning.list_tiles, _LISTING, walks=False),
+    Kernel("list tiles, 2^15 and more", binning.list_tiles, _LISTING, walks=False, types={"keys": "*i32"}),
     *(
         Kernel("densification", _statistics_triton.add_gradients, {"ABSOLUTE": x, "BLOCK": 256}, 4, walks=False)
         for x in (False, True)
@@ -105,16 +120,16 @@ KERNELS = [
     Kernel("Adam", _adam_triton.adam, {"BLOCK": 1024}, 4, walks=False),
     _tiled("composite", compositing.composite_forward, 9, DEPTH=False),
     _tiled("composite, depth", compositing.composite_forward, 10, DEPTH=True),
-    _tiled("composite backward", compositing.composite_backward, 9, **_DRAWN),
-    _tiled("composite backward, depth", compositing.composite_backward, 10, **_DRAWN | {"DEPTH": True}),
-    _tiled("composite backward, in order", compositing.composite_backward, 9, **_DRAWN | {"EACH": True}),
-    _tiled("absolute gradients", compositing.composite_backward, 10, **_DRAWN | {"DEPTH": True, "ABSOLUTE": True}),
+    *_carried("composite backward", depth=False, absolute=False),
+    *_carried("composite backward, depth", depth=True, absolute=False),
+    *_carried("absolute gradients", depth=True, absolute=True),
     *(_tiled(f"masks, {k} at once", compositing.composite_masked, 9, MASKS=k) for k in (1, 2, 4)),
     _tiled("moments", moments.moments_forward, 11, MAX=0.99),
     _tiled("moments backward, shares", moments.moments_backward, 11, MAX=0.99, EACH=False),
     _tiled("moments backward, in order", moments.moments_backward, 11, MAX=0.99, EACH=True),
     _tiled("moments, gsplat's tiles", moments.moments_forward, 11, 16, 4, MAX=0.999),
     _tiled("shares, gsplat's tiles", moments.moments_backward, 11, 16, 4, MAX=0.999, EACH=False),
+    _tiled("shares, gsplat's tiles, in order", moments.moments_backward, 11, 16, 8, MAX=0.999, EACH=True),
     *_photometric("SSIM", EXPECTED=False, LOSS=False),
     *_photometric("loss", EXPECTED=False, LOSS=True),
     *_photometric("expected loss", EXPECTED=True, LOSS=True),
@@ -128,7 +143,8 @@ def compile_ahead(kernel: Kernel, target: str, **options: Any) -> Compiled:
         Exception: Triton's own, for example if it does not know the target.
     """
     names = kernel.function.arg_names
-    signature = {name: "constexpr" if name in kernel.constants else _TYPES.get(name, "*fp32") for name in names}
+    types = _TYPES | dict.fromkeys(kernel.constants, "constexpr") | kernel.types
+    signature = {name: types.get(name, "*fp32") for name in names}
     options = {"num_warps": kernel.warps, "enable_fp_fusion": True} | options
     source = ASTSource(fn=kernel.function, signature=signature, constexprs=kernel.constants)
     code = triton.compile(source, target=TARGETS[target], options=options).asm

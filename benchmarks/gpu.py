@@ -16,8 +16,9 @@ import sys
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,31 +29,53 @@ from benchmarks.counts import Model, counts_table, lists_table
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier
 from ca_reg.neighbors import nearest_neighbors
-from reference_trainer.render import describe_engine, rasterize, render_masks, render_moments, splat, use_engine
+from reference_trainer.render import (
+    describe_engine,
+    rasterize,
+    render_masks,
+    render_moments,
+    splat,
+    use_engine,
+    variance_shares,
+)
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["main"]
 ROOT = Path(__file__).resolve().parents[1]
-TESTS = "tests/reference_trainer/render/triton"
+_HALF = Multiplier.dropout(0.5)
+_COMPARED = (3_000, 128, 0.03)  # Gaussians, pixels along a side, size: float64 takes a processor seconds
 _SIZES = {"small": (20_000, 400, 0.02), "middle": (100_000, 800, 0.012), "large": (500_000, 800, 0.006)}
 
 
 def _ahead(targets: list[str]) -> str:
-    """Return the table of what the kernels need; raise if one spills."""
+    """Return the table of what the kernels need; raise if one spills or fails where others do not."""
     from benchmarks.ahead import KERNELS, TARGETS, compile_ahead, markdown
 
-    rows, unknown = [], []
+    rows, unknown, failed = [], [], []
     for target in targets or TARGETS:
-        try:
-            rows += [compile_ahead(kernel, target) for kernel in KERNELS]
-        except Exception as error:
-            unknown.append(f"{target}: {str(error).splitlines()[0][:200]}")
-    spilled = [f"{x.kernel} on {x.target}: {x.spills}" for x in rows if x.spills]
-    if spilled or not rows:
-        raise RuntimeError("\n".join([markdown(rows), "", "spills: " + ", ".join(spilled), *unknown]))
-    return "\n".join([markdown(rows), "", *(f"not compiled: {x}" for x in unknown)])
+        found, errors = [], []
+        for kernel in KERNELS:
+            try:
+                found.append(compile_ahead(kernel, target))
+            except Exception as error:
+                errors.append(f"{kernel.label} on {target}: {_first_line(error)}")
+        rows += found
+        if found:
+            failed += errors
+        else:  # this Triton does not know the target
+            unknown.append(errors[0])
+    failed += [f"{x.kernel} on {x.target}: {x.spills} spills" for x in rows if x.spills]
+    text = "\n".join([markdown(rows), "", *(f"not compiled, as no kernel of this target: {x}" for x in unknown)])
+    if failed or not rows:
+        raise RuntimeError("\n".join([text, *failed]))
+    return text
+
+
+def _first_line(error: Exception) -> str:
+    """Return what failed in a line."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:200].replace("|", "/")
 
 
 def _tests() -> str:
@@ -64,9 +87,9 @@ def _tests() -> str:
     return done.stdout.strip().splitlines()[-1]
 
 
-def _times() -> Iterator[str]:
+def _times(on: str = "cuda") -> Iterator[str]:
     """Yield milliseconds, peak memory, kernel launches and waits of renders, gradients, masks, scores and steps."""
-    device = torch.device("cuda")
+    device = torch.device(on)
     yield "| workload | work | engine | ms, median of 20 | peak MiB | launches | waits |"
     yield "|:--|:--|:--|---:|---:|---:|---:|"
     for name, size in _SIZES.items():
@@ -102,7 +125,10 @@ def _times() -> Iterator[str]:
                 yield f"| {name} | {label} | {engine} | {' | '.join(_measure(work))} |"
         neighbors = partial(nearest_neighbors, model.tensors[0], 10)
         yield f"| {name} | 10 neighbors of all | - | {' | '.join(_measure(neighbors))} |"
-        yield from _gsplat_times(name, model)
+        try:
+            yield from _gsplat_times(name, model)
+        except Exception as error:
+            yield f"| {name} | all | gsplat | FAILED: {_first_line(error)} | | | |"
     use_engine("triton")
     trainer = Trainer(synthetic_scene(), TrainConfig(dropout=0.2), device)
     yield f"| built-in scene | training step, dropout | triton | {' | '.join(_measure(trainer.train_step))} |"
@@ -113,7 +139,7 @@ def _measure(work: Callable[[], Any]) -> list[str]:
     try:
         return _measured(work)
     except Exception as error:  # name it, and measure the next
-        return [f"FAILED: {str(error).splitlines()[0][:100] if str(error) else type(error).__name__}", "", "", ""]
+        return [f"FAILED: {_first_line(error)}", "", "", ""]
 
 
 def _measured(work: Callable[[], Any]) -> list[str]:
@@ -149,10 +175,10 @@ def _measured(work: Callable[[], Any]) -> list[str]:
 
 def _gsplat_times(name: str, model: Model) -> Iterator[str]:
     """Yield rows of gsplat's own render, and of the exact score over its lists; none where it is missing."""
-    try:
-        import gsplat
-    except ImportError:
+    if find_spec("gsplat") is None:
         return
+    import gsplat
+
     from reference_trainer.render.triton.gsplat import GsplatMoments
 
     means, quats, scales, opacities, colors = model.tensors
@@ -181,37 +207,74 @@ def _rasterize(gsplat: Any, model: Model, *tensors: Tensor) -> Any:
     return gsplat.rasterization(*tensors, pose, intrinsics[None], c.width, c.height, near_plane=0.2, packed=False)
 
 
-def _agreement() -> str:
-    """Return how far gsplat and the engines torch and triton are apart, on a card."""
-    model = Model.of(5_000, 256, 0.03, "cuda")
-    images, variances = {}, {}
-    for engine in ("torch", "triton"):
-        use_engine(engine)
-        with torch.no_grad():
-            splats = splat(*model.tensors[:4], model.camera, colors=model.tensors[4])
-            images[engine] = rasterize(splats).image
-            variances[engine] = render_moments(splats, Multiplier.dropout(0.5)).variance
+def _outcome(engine: str, device: str, dtype: torch.dtype = torch.float32) -> dict[str, list[Tensor]]:
+    """Return what an engine makes of a model: pictures, moments, shares and gradients, on the processor."""
+    use_engine(engine)
+    model = Model.of(*_COMPARED, device)
+    leaves = [x.to(dtype).requires_grad_() for x in model.tensors]
+    splats = splat(*leaves[:4], model.camera.to(dtype=dtype), colors=leaves[4])
+    image, (mean, variance, _) = rasterize(splats).image, render_moments(splats, _HALF)
+    found = {
+        "picture": [image],
+        "mean": [mean],
+        "variance": [variance],
+        "shares": [variance_shares(splats, _HALF, torch.ones_like(image[0]))],
+        "gradients of a picture": torch.autograd.grad(image.square().sum(), leaves, retain_graph=True),
+        "gradients of moments": torch.autograd.grad((mean.square() + variance).sum(), leaves),
+    }
+    return {name: [x.detach().cpu() for x in tensors] for name, tensors in found.items()}
+
+
+def _gsplat_outcome(device: str) -> dict[str, list[Tensor]]:
+    """Return gsplat's picture, and moments and shares over its lists."""
+    import gsplat
+
+    from reference_trainer.render.triton.gsplat import GsplatMoments
+
+    model = Model.of(*_COMPARED, device)
+    with torch.no_grad():
+        shown, _, meta = _rasterize(gsplat, model, *model.tensors)
+    moments = GsplatMoments(lambda opacity, view: (model.tensors[4], meta))
+    given = model.tensors[3], None, _HALF, None
+    mean, variance, _ = moments(*given)
+    found = {"picture": shown[0].permute(2, 0, 1), "mean": mean, "variance": variance}
+    found["shares"] = moments.shares(*given, weights=torch.ones_like(mean[0]))
+    return {name: [x.cpu()] for name, x in found.items()}
+
+
+def _agreement(device: str = "cuda") -> Iterator[str]:
+    """Yield how far gsplat and the engines are from the engine torch in float64 on the processor."""
+    exact = _outcome("torch", "cpu", torch.float64)
+    makers = {"triton": partial(_outcome, "triton", device), "torch": partial(_outcome, "torch", device)}
+    if find_spec("gsplat") is not None:
+        makers["gsplat"] = partial(_gsplat_outcome, device)
+    yield f"| largest error over the largest value | {' | '.join(exact)} |"
+    yield f"|:--|{'---:|' * len(exact)}"
+    for name, make in makers.items():
+        try:
+            found = make()
+        except Exception as error:  # name it, and go on with the next
+            yield f"| {name} | FAILED: {_first_line(error)} |{' |' * (len(exact) - 1)}"
+            continue
+        yield f"| {name} | {' | '.join(_apart(found[x], exact[x]) if x in found else '' for x in exact)} |"
+    before = torch.are_deterministic_algorithms_enabled()
+    torch.use_deterministic_algorithms(True)
     try:
-        import gsplat
+        one, other = (_outcome("triton", device) for _ in range(2))
+    finally:
+        torch.use_deterministic_algorithms(before)
+    changed = [name for name in one if not all(map(torch.equal, one[name], other[name]))]
+    yield ""
+    yield (f"FAILED: deterministic runs differ in {', '.join(changed)}" if changed else "Deterministic runs agree.")
 
-        from reference_trainer.render.triton.gsplat import GsplatMoments
 
-        with torch.no_grad():
-            shown, _, meta = _rasterize(gsplat, model, *model.tensors)
-        moments = GsplatMoments(lambda opacity, view: (model.tensors[4], meta))
-        images["gsplat"] = shown[0].permute(2, 0, 1)
-        variances["gsplat"] = moments(model.tensors[3], None, Multiplier.dropout(0.5), None).variance
-    except ImportError:
-        pass
-    out = ["| against the engine torch | largest difference of a color | of a variance |", "|:--|---:|---:|"]
-    for name in images.keys() - {"torch"}:
-        apart = ((x[name] - x["torch"]).abs().max().item() for x in (images, variances))
-        out.append(f"| {name} | {' | '.join(f'{x:.1e}' for x in apart)} |")
-    return "\n".join(out)
+def _apart(found: Sequence[Tensor], exact: Sequence[Tensor]) -> str:
+    """Return the largest error of some tensors, each relative to its largest number."""
+    return f"{max(float((a - b).abs().max() / b.abs().max()) for a, b in zip(found, exact, strict=True)):.1e}"
 
 
 def main(arguments: list[str]) -> int:
-    """Print one section, or all that this machine can do; return the number of those that failed."""
+    """Print one section, or all that this machine can do; return how many of those, and of their lines, failed."""
     alone: dict[str, Callable[[], str | Iterator[str]]] = {
         "ahead": partial(_ahead, arguments[1:]),
         "count": counts_table,
@@ -236,6 +299,7 @@ def main(arguments: list[str]) -> int:
         try:
             text = section()
             for line in [text] if isinstance(text, str) else text:
+                failed += "FAILED: " in line
                 print(line, flush=True)
         except Exception as error:  # a card can refuse anything: name it, and go on
             failed += 1

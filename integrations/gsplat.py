@@ -15,7 +15,9 @@ import importlib
 import inspect
 import itertools
 import re
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable, Iterator, MutableMapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, ClassVar, Self
 
 import torch
@@ -26,13 +28,17 @@ from ca_reg._random import seeded
 from ._calls import Call, Signature, chain_of
 from ._report import Hook, Tally
 
-__all__ = ["Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized"]
+__all__ = [
+    "Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized",
+    "unregularized_calls",
+]  # fmt: skip
 
 Rasterization = Callable[..., tuple[Any, ...]]
 """``gsplat.rasterization``, or a function with its arguments that returns its ``info`` last."""
 
 _HOLDERS = ("gsplat", "gsplat.rendering")  # the public modules that scripts import the functions from
 _OLDEST = (1, 4)
+_PLAIN = ContextVar("_PLAIN", default=False)  # of a thread: another one may train meanwhile
 _EVIDENCE = 10.0  # dropped Gaussians expected in a list; that none is there by chance has probability e^-10
 
 
@@ -145,6 +151,8 @@ class Regularized:
 
     def _rasterize(self, args: tuple[Any, ...], kwargs: dict[str, Any], *, trains: bool) -> tuple[Any, ...]:
         """Rasterize in training mode if ``trains`` and gradients reach the opacities, else in evaluation mode."""
+        if _PLAIN.get():
+            return self.rasterization(*args, **kwargs)
         call = _GsplatCall(self.rasterization, self._signature, args, kwargs)
         opacities: Tensor = call.arguments["opacities"]
         trains = trains and torch.is_grad_enabled() and opacities.requires_grad
@@ -299,3 +307,13 @@ def load_gsplat(device: torch.device | None = None) -> Any:
 def unregularized(rasterization: Rasterization) -> Rasterization:
     """Return the wrapped function if ``rasterization`` is regularized, else ``rasterization`` itself."""
     return rasterization.rasterization if isinstance(rasterization, Regularized) else rasterization
+
+
+@contextmanager
+def unregularized_calls() -> Iterator[None]:
+    """Let regularized functions pass opacities as they are within a block, for scores that choose them themselves."""
+    token = _PLAIN.set(True)
+    try:
+        yield
+    finally:
+        _PLAIN.reset(token)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -37,7 +38,8 @@ class GsplatModel:
     """Gaussians to be rendered by gsplat, without their opacities. Needs a CUDA device.
 
     ``CAScore(model.render)`` samples; ``CAScore.exact(ListMoments(model.lists))`` is exact and needs gsplat 1.5 or
-    newer. Both bypass a regularizer that wraps or replaces ``gsplat.rasterization``.
+    newer; ``CAScore.exact(GsplatMoments(model.rasterized))`` of `reference_trainer.render.triton.gsplat` needs Triton,
+    and one pass. All bypass a regularizer that wraps or replaces ``gsplat.rasterization``.
 
     Args:
         means: world coordinates, shape (N, 3).
@@ -74,15 +76,16 @@ class GsplatModel:
 
         Raises an ImportError without gsplat, a RuntimeError if the Gaussians are not on a CUDA device.
         """
-        colors, alphas, _ = unregularized(load_gsplat(self.means.device).rasterization)(
-            **self._given(view),
-            opacities=opacity.reshape(-1),
-            colors=self.colors,
-            sh_degree=self.sh_degree,
-            backgrounds=None if self.background is None else self.background[None],
-            rasterize_mode="antialiased" if self.antialiased else "classic",
-        )
+        colors, alphas, _ = self._rasterize(opacity, view, colors=self.colors, sh_degree=self.sh_degree)
         return colors[0].permute(2, 0, 1), alphas[0, ..., 0]
+
+    def rasterized(self, opacity: Tensor, view: GsplatView) -> tuple[Tensor, Mapping[str, Any]]:
+        """Return the colors of all Gaussians towards a view, RGB, (N, 3), and gsplat's ``meta`` of its render.
+
+        Arguments and errors are those of :meth:`render`. The background is not among them: give it to what takes these.
+        """
+        colors = self._colors(load_gsplat(self.means.device), view)
+        return colors, self._rasterize(opacity, view, colors=colors)[2]
 
     def lists(self, opacity: Tensor, view: GsplatView) -> PixelLists:
         """List what every pixel composites, without early termination, for :class:`~ca_reg.lists.ListMoments`.
@@ -92,6 +95,9 @@ class GsplatModel:
         """
         gsplat = load_gsplat(self.means.device)
         flat = opacity.reshape(-1)
+        if not len(flat):  # which not every gsplat can list
+            none = flat.long()
+            return PixelLists(none, none, flat, flat.view(0, 3), view.height, view.width, self.background)
         radii, means2d, depths, conics, compensations = gsplat.fully_fused_projection(
             **self._given(view), covars=None, calc_compensations=self.antialiased, opacities=flat
         )
@@ -105,6 +111,16 @@ class GsplatModel:
         alphas = (opacities[0, gaussians] * falloff).clamp(max=_largest_alpha(flat.device))
         return PixelLists(
             gaussians, pixels, alphas, self._colors(gsplat, view), view.height, view.width, self.background
+        )
+
+    def _rasterize(self, opacity: Tensor, view: GsplatView, **colors: Any) -> tuple[Any, ...]:
+        """Return colors, alphas and ``meta`` of gsplat's own render."""
+        return unregularized(load_gsplat(self.means.device).rasterization)(
+            **self._given(view),
+            **colors,
+            opacities=opacity.reshape(-1),
+            backgrounds=None if self.background is None else self.background[None],
+            rasterize_mode="antialiased" if self.antialiased else "classic",
         )
 
     def _given(self, view: GsplatView) -> dict[str, Any]:

@@ -5,6 +5,7 @@ Nothing here imports torch, which takes seconds: a mistyped path is answered bef
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,12 +51,18 @@ class RenderOptions:
     def begin(self, device: str, *, trains: bool = False) -> None:
         """Choose the engine of this process and its workers, and print which it is.
 
-        One that ``trains`` needs all loops: those not compiled yet are then compiled now, with progress.
+        One that ``trains`` needs all loops: those not compiled yet are then compiled now, with progress. Raises a
+        ValueError for triton on a processor, unless its interpreter is asked for.
         """
         import torch
 
         from reference_trainer.render import describe_engine, use_engine
 
+        if self.engine == "triton" and device == "cpu" and os.environ.get("TRITON_INTERPRET") != "1":
+            raise ValueError(
+                "the engine triton renders on a card, not on cpu: give --device cuda or another engine "
+                "(TRITON_INTERPRET=1 interprets its kernels on a processor, slowly)."
+            )
         if self.engine is not None:
             use_engine(self.engine)
         hint = "; a CUDA card is here: --device cuda uses it" if device == "cpu" and torch.cuda.is_available() else ""

@@ -80,7 +80,12 @@ def adam_step(
         step: number of this step, from 1 on.
         betas: decay of the moments.
         epsilon: what is added to the root of the second moment.
+
+    Raises:
+        ValueError: for a tensor of 2^31 numbers or more, which the kernel cannot count.
     """
+    if (most := max((one[0].numel() for one in tensors), default=0)) > 2**31 - _BLOCK:
+        raise ValueError(f"a tensor must have fewer than 2^31 numbers, got {most}: train with use_engine('torch').")
     beta1, beta2 = betas
     # Both corrections, and what is 1 minus a number, in double precision on the processor.
     mean_correction, correction = 1 - beta1**step, (1 - beta2**step) ** -0.5

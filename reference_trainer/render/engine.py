@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import importlib.util
 import os
+import shutil
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -37,7 +39,7 @@ def use_engine(name: str) -> None:
 
     Raises:
         ValueError: if there is no such engine.
-        ImportError: if numba or triton is asked for and missing.
+        ImportError: if numba or triton is asked for and missing, or too old, or without its C compiler.
 
     Example:
         >>> use_engine("torch")
@@ -49,7 +51,10 @@ def use_engine(name: str) -> None:
     if name == "numba" and _compiled_engine("numba") is None:
         raise ImportError("the engine numba needs numba: pip install 'ca_reg[trainer]', or use the engine torch.")
     if name == "triton" and _compiled_engine("triton") is None:
-        raise ImportError("the engine triton needs Triton: pip install triton (Linux), or use the engine torch.")
+        raise ImportError(
+            "the engine triton needs Triton 3.4 or newer, which comes with torch 2.8 for cards (or pip install "
+            "'triton>=3.4', Linux), and a C compiler; or use the engine torch."
+        )
     os.environ[_VARIABLE] = name
 
 
@@ -159,10 +164,21 @@ def _compiled_engine(name: str) -> Engine | None:
     if importlib.util.find_spec(name) is None:
         return None
     try:
+        if name == "triton":
+            _check_compiler()
         return _CompiledEngine(name)
     except ImportError as error:  # such as a NumPy that is too new for numba
-        warnings.warn(f"{name} is installed but cannot be imported ({error}): the engine torch renders.", stacklevel=2)
+        warnings.warn(f"{name} is installed but cannot be used ({error}): the engine torch renders.", stacklevel=2)
         return None
+
+
+def _check_compiler() -> None:
+    """Raise an ImportError where Triton finds no C compiler to build what starts its kernels."""
+    # Windows' builds bring one, and the interpreter starts nothing.
+    if sys.platform == "win32" or os.environ.get("TRITON_INTERPRET") == "1":
+        return
+    if "CC" not in os.environ and shutil.which("gcc") is None and shutil.which("clang") is None:
+        raise ImportError("it needs a C compiler: install gcc or clang, or name one by CC")
 
 
 def _runs_triton(device: torch.device, chosen: str) -> bool:

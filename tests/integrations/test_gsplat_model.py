@@ -85,6 +85,29 @@ def test_the_exact_score_is_the_limit_of_the_sampled_one(package):
     assert abs(exact.value - result.value) < 4 * result.std_error  # fixed seed; fails by chance once in 16,000 seeds
 
 
+def test_no_gaussian_is_an_empty_list(package):
+    scene = random_scene(3, WIDTH, HEIGHT, seed=1)
+    model, view = model_of(scene._replace(**{x: getattr(scene, x)[:0] for x in scene._fields if x != "camera"}))
+    lists = model.lists(torch.ones(0, 1), view)
+    assert [x.shape for x in lists[:4]] == [(0,), (0,), (0,), (0, 3)]
+    moments = ListMoments(model.lists)(torch.ones(0), view, Multiplier.dropout(0.5), None)
+    assert torch.equal(moments.mean, BACKGROUND[:, None, None].expand(3, HEIGHT, WIDTH))
+    assert moments.variance.max() == moments.alpha_mean.max() == 0
+
+
+def test_the_colors_and_the_meta_of_a_render_are_not_regularized(package):
+    scene = random_scene(50, WIDTH, HEIGHT, seed=4).to(torch.float32)
+    sh = torch.randn(50, 4, 3, generator=torch.Generator().manual_seed(0))
+    package.rasterization = regularized(package.rasterization, GaussianDropout(0.5))
+    model, view = model_of(scene, colors=sh, sh_degree=1)
+    with torch.no_grad():
+        colors, meta = model.rasterized(scene.opacities[:, None], view)
+    assert torch.equal(colors, model.lists(scene.opacities, view).colors)
+    seen = (meta["radii"][0] > 0).all(-1)
+    assert torch.equal(meta["opacities"][0, seen], scene.opacities[seen])
+    assert package.rasterization.tally.regularized == package.rasterization.tally.scaled == 0
+
+
 def test_lists_go_on_behind_an_opaque_surface(package):
     scene = random_scene(4, WIDTH, HEIGHT, seed=1, size=0.5)
     means = torch.zeros(4, 3, dtype=torch.float64)
@@ -149,7 +172,7 @@ def test_the_arguments_are_those_of_the_package():
 
 def test_a_cpu_is_refused():
     model, view = model_of(random_scene(3, WIDTH, HEIGHT, seed=0))
-    for method in (model.render, model.lists):
+    for method in (model.render, model.rasterized, model.lists):
         with pytest.raises(RuntimeError, match="on CUDA devices only, and the Gaussians are on cpu"):
             method(torch.ones(3), view)
 

@@ -66,7 +66,7 @@ def composite_forward(
                 if DEPTH:
                     d += weight * tl.load(row + 9)
         begin += _CHUNK
-    t, size = tl.abs(t), width * height
+    t, size = tl.abs(t), (width * height).to(tl.int64)
     tl.store(alpha + place, 1 - t, mask=inside)
     _store_over(image, place, size, inside, r, g, b, t, background)
     if DEPTH:
@@ -90,7 +90,7 @@ def composite_backward(
     """
     tile = tl.program_id(0)
     x, y, place, inside = pixels(tile, width, height, columns, TILE)
-    size = width * height
+    size = (width * height).to(tl.int64)  # ten planes may have more than 2^31 numbers
     u_a = tl.load(to_alpha + place, mask=inside, other=0.0)
     u_r, u_g, u_b = tiles.load3(to_image, place, size, inside)
     r, g, b = tiles.load3(image, place, size, inside)
@@ -167,7 +167,7 @@ def composite_masked(
                 g += weight * tl.load(row + 7)
                 b += weight * tl.load(row + 8)
         begin += _CHUNK
-    t, size = tl.abs(t), width * height
+    t, size = tl.abs(t), (width * height).to(tl.int64)
     at = which.to(tl.int64)[:, None] * size + place[None, :]
     tl.store(alphas + at, 1 - t, mask=shown)
     at += which.to(tl.int64)[:, None] * (2 * size)  # three channels each

@@ -7,6 +7,7 @@ gsplat's ``meta`` (1.4, 1.5, main) holds what the moments need: ``means2d, conic
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
+from ca_reg.integrations.gsplat import unregularized_calls
 from ca_reg.types import ExactMoments
 from reference_trainer.render.triton.moments import moments_of, shares_of
 from reference_trainer.render.triton.tiles import Lists
@@ -24,9 +26,12 @@ __all__ = ["GsplatMoments"]
 class GsplatMoments:
     """A moments callable for `ca_reg.CAScore` from gsplat's ``meta``; not differentiable, one camera per call.
 
+    A regularizer that wraps or replaces ``gsplat.rasterization`` is bypassed, as the multiplier takes its place.
+
     Args:
         rasterize: ``rasterize(opacities, view)`` returns the colors of all N Gaussians towards the view, RGB, (N, 3),
-            and gsplat's ``meta`` of a render with these activated opacities, (N,) or (N, 1); packed or not.
+            and gsplat's ``meta`` of a render with these activated opacities, (N,) or (N, 1); packed or not. Such is
+            ``rasterized`` of a `ca_reg.integrations.gsplat_model.GsplatModel`.
         background: the model's own, shape (3,); None for black.
         max_alpha: where this gsplat clamps alphas; by default that of the installed version, 0.999 before 1.6, which
             is then 0.99.
@@ -54,7 +59,8 @@ class GsplatMoments:
         """Return the exact moments of a view: mean and variance (3, H, W) and the expected alpha (H, W).
 
         Raises:
-            ValueError: if ``meta`` is of several cameras, or the colors are not RGB of all Gaussians.
+            ValueError: if ``meta`` is of several cameras or of tiles whose side is no power of two, or the colors are
+                not RGB of all Gaussians.
         """
         table, lists, behind, _ = self._prepared(opacity, view, multiplier, background)
         return ExactMoments(*moments_of(table, lists, behind))
@@ -72,11 +78,15 @@ class GsplatMoments:
         self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None
     ) -> tuple[Tensor, Lists, Tensor, Tensor | None]:
         """Return the table of the listed splats, the lists, what is behind, and which Gaussians the splats are."""
-        colors, meta = self.rasterize(opacity, view)
+        with unregularized_calls():
+            colors, meta = self.rasterize(opacity, view)
         if meta["isect_offsets"].shape[:-2].numel() != 1:
             raise ValueError(f"meta must be of one camera, got isect_offsets {tuple(meta['isect_offsets'].shape)}.")
         if colors.shape != (len(opacity), 3):
             raise ValueError(f"colors must be RGB of all Gaussians, {(len(opacity), 3)}, got {tuple(colors.shape)}.")
+        tile = int(meta["tile_size"])
+        if tile & (tile - 1):
+            raise ValueError(f"tile_size must be a power of two, got {tile}: rasterize with tile_size=16.")
         a, b, c = meta["conics"].reshape(-1, 3).float().unbind(1)
         # The conic ((a, b), (b, c)) is the square of its triangular factor: l11^2 = a, l11 l21 = b, l21^2 + l22^2 = c.
         l11 = a.clamp_min(1e-30).sqrt()
@@ -95,7 +105,7 @@ class GsplatMoments:
         table = torch.cat([*columns, rows(multiplier.mean), rows(multiplier.variance)], dim=1).float()
         ids, size = meta["flatten_ids"].int(), (3, int(meta["height"]), int(meta["width"]))
         starts = torch.cat([meta["isect_offsets"].flatten().int(), ids.new_full((1,), len(ids))])
-        lists = Lists(starts, ids, size[2], size[1], int(meta["tile_size"]), self.max_alpha or _max_alpha())
+        lists = Lists(starts, ids, size[2], size[1], tile, self.max_alpha or _max_alpha())
         background = self.background if background is None else background
         behind = a.new_zeros(3) if background is None else background.to(a)
         return table, lists, (behind if behind.ndim == 3 else behind[:, None, None]).expand(size), which
@@ -104,4 +114,4 @@ class GsplatMoments:
 def _max_alpha() -> float:
     """Return where the installed gsplat clamps alphas."""
     version = importlib.import_module("gsplat").__version__  # it is distributed by another name too: amd-gsplat
-    return 0.999 if tuple(int(x) for x in version.split(".")[:2]) < (1, 6) else 0.99
+    return 0.999 if [int(part) for part in re.findall(r"\d+", version)[:2]] < [1, 6] else 0.99

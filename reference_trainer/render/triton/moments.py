@@ -18,6 +18,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from reference_trainer.render.constants import TILE
 from reference_trainer.render.splats import MomentImages, Splats
 from reference_trainer.render.triton import tiles
 from reference_trainer.render.triton.tiles import FAINT, Lists, add_row, alpha_at, geometry_sums, make_row, pixels
@@ -46,7 +47,7 @@ def moments_forward(
     """Composite mean and variance (3, H, W) and the expected alpha (H, W) of a tile, back to front."""
     tile = tl.program_id(0)
     x, y, place, inside = pixels(tile, width, height, columns, TILE)
-    size = width * height
+    size = (width * height).to(tl.int64)  # ten planes may have more than 2^31 numbers
     m0, m1, m2 = tiles.load3(background, place, size, inside)
     v0, v1, v2, t = tl.zeros_like(m0), tl.zeros_like(m0), tl.zeros_like(m0), tl.zeros_like(m0) + 1
     begin, e = tl.load(starts + tile), tl.load(starts + tile + 1) - 1
@@ -124,14 +125,14 @@ def moments_backward(
 
     What is behind a splat (its contrast, hidden, T) is only known back to front, all else only front to back. Keeping
     it of every entry would take 1,280 bytes each, and undoing the recursion divides by ``passed``, unstable in thick
-    stacks. So a first walk keeps every 16th state (80 bytes per entry), and the second restores 16 entries at a time
-    into memory that a program uses again and again.
+    stacks. So a first walk keeps every 16th state (80 bytes per entry, 320 on gsplat's tiles), and the second restores
+    16 entries at a time into memory that a program uses again and again (84 MB or 335 MB at most).
     """
     program = tl.program_id(0)
     PIXELS: tl.constexpr = TILE * TILE
     kept = checkpoints + program.to(tl.int64) * (_CHUNK * _STATE * PIXELS)
     checkpoints += tl.num_programs(0).to(tl.int64) * (_CHUNK * _STATE * PIXELS)
-    size = width * height
+    size = (width * height).to(tl.int64)  # ten planes may have more than 2^31 numbers
     for tile in range(program, count, tl.num_programs(0)):
         x, y, place, inside = pixels(tile, width, height, columns, TILE)
         of_variance = tiles.load3(images + 3 * size, place, size, inside)
@@ -202,9 +203,11 @@ def _gradients(table: Tensor, lists: Lists, images: Tensor) -> tuple[Tensor, Ten
     rows, each = tiles.gradient_rows(lists, table)
     programs, saved = min(_PROGRAMS, lists.tiles), len(lists.gaussians) // _CHUNK.value + lists.tiles + 1
     checkpoints = table.new_empty(programs * _CHUNK.value + saved, _STATE.value, lists.tile**2)
+    # With two pixels to a lane, rows of single entries on gsplat's tiles would spill on a Turing card.
+    per_warp = 32 if each and lists.tile > TILE else 64
     tiles.over_tiles(
-        moments_backward, lists, table, images, checkpoints, rows, lists.tiles, programs=programs, MAX=lists.max_alpha,
-        EACH=each,
+        moments_backward, lists, table, images, checkpoints, rows, lists.tiles, programs=programs, per_warp=per_warp,
+        MAX=lists.max_alpha, EACH=each,
     )  # fmt: skip
     return tiles.sum_rows(rows, each, lists, len(table)), images[:3]
 

@@ -74,12 +74,14 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 1, 
             kernel[grid](*arguments, num_warps=warps, enable_fp_fusion=True, **constants)
 
 
-def over_tiles(kernel: Any, lists: Lists, table: Tensor, *arguments: Any, programs: int = 0, **constants: Any) -> None:
-    """Start a program for every tile, or as many as told; a warp has 64 pixels."""
+def over_tiles(
+    kernel: Any, lists: Lists, table: Tensor, *arguments: Any, programs: int = 0, per_warp: int = 64, **constants: Any
+) -> None:
+    """Start a program for every tile, or as many as told; a warp has 64 pixels, or as many as told."""
     size = lists.width, lists.height, -(-lists.width // lists.tile)
     launch(
         kernel, (programs or lists.tiles,), table, lists.starts, lists.gaussians, *arguments, *size,
-        warps=max(1, lists.tile**2 // 64), STRIDE=table.shape[1], TILE=lists.tile, **constants,
+        warps=max(1, lists.tile**2 // per_warp), STRIDE=table.shape[1], TILE=lists.tile, **constants,
     )  # fmt: skip
 
 
@@ -117,7 +119,8 @@ def gradient_rows(lists: Lists, table: Tensor) -> tuple[Tensor, bool]:
     """Return zeros for the rows of gradients, and whether there is one per entry instead of one per splat.
 
     Atomic additions come in any order. Where PyTorch is asked for deterministic algorithms, every entry of the lists
-    has a row of its own, 64 bytes, which `sum_rows` adds up in one order.
+    has a row of its own, 64 bytes, which `sum_rows` adds up in one order: 140 bytes per entry at its peak, with the
+    sorted rows and their order.
     """
     each = torch.are_deterministic_algorithms_enabled()
     return table.new_zeros(len(lists.gaussians) if each else len(table), ROW.value), each

@@ -243,6 +243,7 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["plan", "nowhere"], "there is no scene folder nowhere"),
         (["compare", "nowhere"], "there is no scene folder nowhere"),
         (["train", "--engine", "loops"], "--engine loops is a name of earlier versions: this engine is called"),
+        (["warmup", "--engine", "triton"], "the engine triton renders on a card, not on cpu: give --device cuda"),
         (["train", "--regularizer", "dropot(0.2)"], "there is no regularizer 'dropot'; choose one of"),
         (["train", "--loss", "photometric(2.0)"], "lambda_dssim must lie in [0, 1], got 2.0"),
         (["train", "--density", "none"], "there is no density strategy 'none'"),

@@ -208,6 +208,15 @@ def test_the_kernel_in_the_interpreter_passes_all_tests_of_this_file():
     assert " passed" in done.stdout
 
 
+def test_a_tensor_that_the_kernel_cannot_count_is_refused():
+    pytest.importorskip("triton")
+    from reference_trainer.model._adam_triton import adam_step
+
+    x = torch.zeros(1).expand(2**31)
+    with pytest.raises(ValueError, match="fewer than 2\\^31 numbers, got 2147483648"):
+        adam_step([(x, x, x, x, 0.1)], 1, (0.9, 0.999), 1e-15)
+
+
 def test_a_parameter_whose_numbers_lie_in_another_order_in_memory():
     """As spherical harmonics do that come from a file channel by channel."""
     start, ids = some(4), torch.arange(4.0)

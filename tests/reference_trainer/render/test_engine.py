@@ -1,6 +1,8 @@
 """Which engine renders, and the choice of the user afterwards."""
 
 import os
+import shutil
+import sys
 from importlib.util import find_spec
 
 import pytest
@@ -8,6 +10,7 @@ import torch
 from oracles import random_scene
 
 from reference_trainer.render import describe_engine, render, use_engine
+from reference_trainer.render import engine as engine_module
 from reference_trainer.render.engine import engine_for, engines_on, using_engine
 
 pytest.importorskip("numba")
@@ -16,6 +19,15 @@ pytest.importorskip("numba")
 @pytest.fixture(autouse=True)
 def restored(monkeypatch):
     monkeypatch.setenv("CA_REG_ENGINE", "auto")
+    monkeypatch.setenv("CC", "cc")  # a compiler, whatever this machine has
+
+
+@pytest.fixture
+def afresh():
+    """Engines are looked for again, now and after the test."""
+    engine_module._compiled_engine.cache_clear()
+    yield
+    engine_module._compiled_engine.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -52,6 +64,34 @@ def test_the_line_of_a_triton_that_came_by_another_name(unnamed):
     triton = pytest.importorskip("triton")
     unnamed("triton")
     assert describe_engine("cuda") == f"triton ({triton.__version__})"
+
+
+@pytest.mark.parametrize("version", ["3.1.0", "3.3.1", "3.3.1+git5c1e5bb"])
+def test_a_triton_that_compiles_no_tuples_is_as_good_as_none(version, afresh, monkeypatch):
+    """As that of torch 2.5 to 2.7: said once, and refused by name."""
+    monkeypatch.setattr(pytest.importorskip("triton"), "__version__", version)
+    for name in [x for x in sys.modules if x.startswith("reference_trainer.render.triton")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.warns(UserWarning, match=r"need Triton 3\.4 or newer, which comes with torch 2\.8, got 3\.") as warned:
+        assert describe_engine("cuda") == describe_engine("cuda") == "torch"
+    assert len(warned) == 1
+    assert engines_on(torch.device("cuda")) == ("torch",)
+    with pytest.raises(ImportError, match=r"the engine triton needs Triton 3\.4"):
+        use_engine("triton")
+
+
+def test_triton_without_a_c_compiler_is_as_good_as_none(afresh, monkeypatch):
+    pytest.importorskip("triton")
+    monkeypatch.delenv("CC")
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.warns(UserWarning, match="needs a C compiler: install gcc or clang, or name one by CC"):
+        assert describe_engine("cuda") == "torch"
+    with pytest.raises(ImportError, match=r"the engine triton needs .* a C compiler"):
+        use_engine("triton")
+    engine_module._compiled_engine.cache_clear()
+    monkeypatch.setattr(shutil, "which", lambda name: "/usr/bin/clang" if name == "clang" else None)
+    assert describe_engine("cuda").startswith("triton")
 
 
 def test_an_engine_that_does_not_exist(monkeypatch):

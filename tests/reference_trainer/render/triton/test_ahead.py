@@ -1,4 +1,4 @@
-"""The kernels compiled ahead of time for cards that differ most, and nothing spilled.
+"""The kernels compiled ahead of time for cards that differ most: nothing spills, and nothing grows unnoticed.
 
 They are NVIDIA's oldest and newest, and AMD's two widths of a warp; `python -m benchmarks.gpu ahead` takes all cards
 that the installed Triton knows. In processes of their own: a kernel that was made for Triton's interpreter cannot be
@@ -16,6 +16,10 @@ from subprocesses import subprocess_environment
 pytest.importorskip("triton")
 pytest.importorskip("scipy")
 ROOT = Path(__file__).parents[4]
+BOUNDS = json.loads((ROOT / "benchmarks" / "data" / "kernels.json").read_text("utf-8"))
+"""Most registers and instructions per entry of every kernel by maker, as `python -m benchmarks.gpu ahead` printed them
+with Triton 3.9."""
+SLACK = 1.5  # for other versions of Triton; a doubling of a loop or of registers is seen
 
 
 def run(*arguments):
@@ -31,16 +35,28 @@ def compiled(code):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("target", "registers"), [("sm_75", 128), ("sm_120", 128), ("gfx90a", 256), ("gfx1201", 256)])
-def test_nothing_spills(target, registers):
+@pytest.mark.parametrize("target", ["sm_75", "sm_120", "gfx90a", "gfx1201"])
+def test_nothing_spills_or_takes_much_more_than_it_did(target):
     """The projections of one and two bands lie between those of none and of three, and took a quarter of the time."""
     some = "[k for k in KERNELS if not k.label.endswith(('degree 1', 'degree 2'))]"
     rows = compiled(f"[dataclasses.asdict(compile_ahead(k, {target!r})) for k in {some}]")
     assert rows
     assert [row["kernel"] for row in rows if row["spills"]] == []
-    assert max(row["registers"] for row in rows) <= registers
-    # A walk over a list is at least the exponential and the recursion, and no copy of the whole kernel.
-    assert all(15 < row["per_entry"] < row["instructions"] for row in rows if row["per_entry"] is not None)
+    for row in rows:
+        registers, per_entry = BOUNDS[row["kernel"]]["NVIDIA" if target.startswith("sm_") else "AMD"]
+        assert row["registers"] <= SLACK * registers, row
+        if per_entry is not None:  # the exponential and the recursion at least, and no copy of the whole kernel
+            assert 15 < row["per_entry"] < min(SLACK * per_entry, row["instructions"]), row
+
+
+def test_the_table_of_the_page_has_the_numbers_of_the_bounds():
+    page = (ROOT / "docs" / "gpu.md").read_text("utf-8").split("| kernel | registers |")[1].split("\n\n")[0]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines()[2:]]
+    assert len(rows) == 6
+    for name, *spans in rows:
+        (registers, nvidia), (same, amd) = BOUNDS[name]["NVIDIA"], BOUNDS[name]["AMD"]
+        most = [int(span.split(" to ")[-1]) if span else None for span in spans]
+        assert most == [max(registers, same), nvidia, amd], name
 
 
 @pytest.mark.slow

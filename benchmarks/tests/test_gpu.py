@@ -1,0 +1,100 @@
+"""The command for the first minute on a card: what fails is named and counted, and the rest goes on."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("triton")
+pytest.importorskip("scipy")
+
+from benchmarks import gpu
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def compiler(monkeypatch):
+    """Kernels a and b and a compiler that knows sm_90 alone, and refuses some kernels there."""
+    from benchmarks import ahead
+
+    refused, spilled = set(), set()
+
+    def compile_ahead(kernel, target):
+        if target == "sm_120" or kernel.label in refused:
+            raise RuntimeError(f"no {kernel.label} here\nat all")
+        return ahead.Compiled(kernel.label, target, 40, 0, int(kernel.label in spilled), 100, 60)
+
+    monkeypatch.setattr(ahead, "KERNELS", [ahead.Kernel(x, None, {}) for x in "ab"])
+    monkeypatch.setattr(ahead, "compile_ahead", compile_ahead)
+    return SimpleNamespace(refused=refused, spilled=spilled)
+
+
+def test_a_target_that_compiles_nothing_is_unknown_to_this_triton(compiler):
+    text = gpu._ahead(["sm_90", "sm_120"])
+    assert "| b | NVIDIA | 40 |" in text
+    assert text.endswith("not compiled, as no kernel of this target: a on sm_120: no a here")
+
+
+def test_a_kernel_that_does_not_compile_fails_by_name_and_keeps_the_others(compiler):
+    compiler.refused.add("a")
+    with pytest.raises(RuntimeError, match=r"b .* NVIDIA .*\n(.*\n)*a on sm_90: no a here$"):
+        gpu._ahead(["sm_90"])
+
+
+def test_a_spill_fails_by_name(compiler):
+    compiler.spilled.add("b")
+    with pytest.raises(RuntimeError, match="b on sm_90: 1 spills"):
+        gpu._ahead(["sm_90"])
+
+
+def test_a_measurement_that_failed_is_counted(monkeypatch, capsys):
+    def refuse(work):
+        raise RuntimeError("out of memory\nand more")
+
+    monkeypatch.setattr(gpu, "_measured", refuse)
+    monkeypatch.setattr(gpu, "counts_table", lambda: f"| one | {gpu._measure(None)[0]} |\n| two | 3 |")
+    assert gpu.main(["count"]) == 1
+    assert "| one | FAILED: out of memory |" in capsys.readouterr().out
+
+
+CODE = """
+import json, sys
+from types import SimpleNamespace
+from benchmarks import gpu
+
+gpu._COMPARED, gpu._SIZES = (6, 9, 0.3), {"small": (12, 9, 0.3)}
+gpu.find_spec = lambda name: name  # a gsplat that does not work
+sys.modules["gsplat"] = SimpleNamespace(__version__="1.5.3")
+called = []
+
+def measured(work):
+    if getattr(work, "__name__", "") != "train_step":
+        work()
+    return ["1", "2", "3", "4"]
+
+gpu._measured = measured
+print(json.dumps([list(gpu._agreement("cpu")), list(gpu._times("cpu"))]))
+"""
+
+
+@pytest.mark.slow
+def test_on_a_card_that_is_an_interpreter():
+    environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", CODE], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    agreement, times = json.loads(done.stdout.splitlines()[-1])
+    for row in agreement[2:4]:
+        assert all(float(cell) < 1e-4 for cell in row.split("|")[2:-1])
+    assert agreement[4].startswith("| gsplat | FAILED: ")
+    assert agreement[-1] == "Deterministic runs agree."
+    columns = {row.count("|") for row in (*agreement[:5], *times)}
+    assert columns == {8}
+    failed = [row for row in times if "FAILED" in row]
+    assert all("gsplat" in row for row in failed)
+    assert len(failed) == 3
+    assert times[-1] == "| built-in scene | training step, dropout | triton | 1 | 2 | 3 | 4 |"
