@@ -171,6 +171,15 @@ def test_the_nearest_of_other_points_equal_to_the_full_matrix(monkeypatch, tree,
     torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-6)
 
 
+def test_the_nearest_distance_is_found_on_the_device(device):
+    points, others = _points("spread", 50), _points("clustered", neighbors.TREE_FROM)
+    with counted_synchronizations() as waits:
+        found = nearest_distance(points.to(device), others.to(device))
+    assert not waits
+    assert found.device.type == device.type
+    torch.testing.assert_close(found.cpu(), nearest_distance(points, others), rtol=1e-5, atol=1e-6)
+
+
 @pytest.mark.parametrize("shapes", [((4, 3), (5, 2)), ((4, 3), (0, 3)), ((4,), (4, 3))])
 def test_other_points_of_a_wrong_shape_are_refused(shapes):
     with pytest.raises(ValueError, match=r"expected points \(N, D\) and at least one other"):
