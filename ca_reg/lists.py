@@ -229,7 +229,9 @@ class _Walk(NamedTuple):
         counts = size - torch.searchsorted(lengths, torch.arange(int(lengths[-1]), dtype=dtype), right=True)
         offsets = counts.sum() - counts.cumsum(0)
         places = torch.arange(entries, dtype=dtype, device=device).sub_(starts.index_select(0, pixels))
-        target = offsets.to(device, dtype).index_select(0, places).add_(ranks.index_select(0, pixels))
+        target = (
+            offsets.to(device, dtype, non_blocking=True).index_select(0, places).add_(ranks.index_select(0, pixels))
+        )
         del pixels, places  # memory
         order = torch.empty_like(order).scatter_(0, target.long(), order)
         return cls(

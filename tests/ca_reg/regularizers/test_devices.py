@@ -38,7 +38,9 @@ def test_draw_and_test_time_value_are_those_of_the_cpu(name, device):
             torch.testing.assert_close(y.cpu(), x)
 
 
-@pytest.mark.parametrize("text", [*REGULARIZERS, "density(compensate=True)", "d2gs(literal=True)", "soft(by_size=True)"])
+@pytest.mark.parametrize(
+    "text", [*REGULARIZERS, "density(compensate=True)", "d2gs(literal=True)", "soft(by_size=True)"]
+)
 def test_a_warm_step_does_not_wait_for_the_card(text, card):
     chain = parse(text + ARGUMENTS.get(text, ""))
     x, radii = params(chain, card), torch.ones(N, device=card)
@@ -51,6 +53,15 @@ def test_a_warm_step_does_not_wait_for_the_card(text, card):
                 out.opacities.sum().backward()
             chain.mask_radii(radii)
     assert not found, found
+
+
+@pytest.mark.parametrize("name", list(REGULARIZERS))
+def test_the_test_time_value_copies_nothing_to_the_card(name, card):
+    chain = parse(name + ARGUMENTS.get(name, "")).eval()
+    x = params(chain, card)
+    with counted_synchronizations() as found:
+        chain(x)
+    assert not {"aten::copy_", "aten::_to_copy"} & set(found), found
 
 
 @pytest.mark.parametrize("name", list(REGULARIZERS))
