@@ -50,9 +50,7 @@ class ClusteredDropout(Regularizer):
         super().__init__(p)
         self.k = k
         self.neighbors = Refreshed(every)
-        self._counted: tuple[Tensor, Tensor] | None = (
-            None  # neighbors, and how many Gaussians are in 0, 1, ... clusters
-        )
+        self._counted: tuple[Tensor, Tensor] | None = None  # neighbors; how many Gaussians are in 0, 1, ... clusters
 
     def anchor_rate(self, rate: Rate, neighbors: Tensor) -> Rate:
         """Return the rate of the anchors, given ``p`` at the step and the neighbor indices of all Gaussians, (N, k)."""
