@@ -108,14 +108,14 @@ class _Operations(TorchDispatchMode):
         "_local_scalar_dense",
         "set_",
         "new_empty",
-        "tolist",
     )
 
     def __init__(self) -> None:
         super().__init__()
         self.names: Counter[str] = Counter()
         self.alive: dict[int, tuple[int, int]] = {}  # bytes and tensors of a storage, by its address
-        self.now = self.peak = self.elements = 0
+        self.now = self.peak = self.elements = self.read_backs = 0
+        self.copied: set[int] = set()  # addresses of what the processor has read, while all is on the processor
         self.paused = False
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -123,6 +123,9 @@ class _Operations(TorchDispatchMode):
         if self.paused:
             return out
         schema = func._schema
+        leaves = schema.name == "aten::_to_copy" and out.is_cpu and not args[0].is_cpu
+        if leaves or schema.name in ("aten::_local_scalar_dense", "aten::nonzero"):
+            self.note_read(args[0])
         view = any(x.alias_info is not None and not x.alias_info.is_write for x in schema.arguments)
         if not view:
             self.names[schema.name.removeprefix("aten::")] += 1
@@ -131,6 +134,11 @@ class _Operations(TorchDispatchMode):
                 self.elements += 0 if view else x.numel()
                 self._hold(x)
         return out
+
+    def note_read(self, x: Tensor) -> None:
+        """Count a read-back, unless the numbers are the processor's already."""
+        on_card = torch.cuda.is_available()
+        self.read_backs += not (x.is_cpu if on_card else x.untyped_storage().data_ptr() in self.copied)
 
     def _hold(self, x: Tensor) -> None:
         storage = x.untyped_storage()
@@ -147,25 +155,25 @@ class _Operations(TorchDispatchMode):
             self.alive[key] = size, holders - 1
         else:
             self.now -= size
+            self.copied.discard(key)
 
     @property
     def launches(self) -> int:
         return sum(n for name, n in self.names.items() if name not in self._FREE)
 
-    @property
-    def read_backs(self) -> int:
-        return self.names["_local_scalar_dense"] + self.names["nonzero"] + self.names["tolist"]
 
+class _ReadBacks(TorchFunctionMode):
+    """Notes `tolist` and `cpu`, which PyTorch's dispatcher does not see on a processor."""
 
-class _Lists(TorchFunctionMode):
-    """Counts `tolist`, which PyTorch's dispatcher does not see on a processor."""
-
-    def __init__(self, names: Counter[str]) -> None:
+    def __init__(self, operations: _Operations) -> None:
         super().__init__()
-        self.names = names
+        self.operations = operations
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        self.names["tolist"] += func is Tensor.tolist
+        if func in (Tensor.tolist, Tensor.cpu) and args[0].is_cpu and not self.operations.paused:
+            self.operations.note_read(args[0])
+            if func is Tensor.cpu:
+                self.operations.copied.add(args[0].untyped_storage().data_ptr())
         return func(*args, **(kwargs or {}))
 
 
@@ -195,7 +203,7 @@ def _counted(work: Callable[[], Any]) -> tuple[int, _Operations, Any]:
     from reference_trainer.render.triton import tiles
 
     mode, before = _Operations(), sum(tiles.LAUNCHED.values())
-    with _outside_of_kernels(mode), _Lists(mode.names), mode:
+    with _outside_of_kernels(mode), _ReadBacks(mode), mode:
         out = work()
     return mode.launches + sum(tiles.LAUNCHED.values()) - before, mode, out
 

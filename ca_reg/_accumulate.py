@@ -68,8 +68,8 @@ class RenderMoments:
         squares = (self._squares[:used] * visible).sum(-1).double().sum(-1)
         rows = (self._sums[:used] * visible).flatten(1, 2).transpose(0, 1)
         products = torch.bmm(rows, rows.mT).double().sum(0)
-        rest = self.count - torch.tensor([len(range(group, self.count, self._groups)) for group in range(used)])
-        rest, ratios = rest.to(products), (self.count / (self.count - rest)).to(products)
+        sizes = (self.count - 1 - torch.arange(used, device=products.device)) // self._groups + 1
+        rest, ratios = (self.count - sizes).to(products), (self.count / sizes).to(products)
         others = products.sum() - 2 * products.sum(0) + products.diagonal()
         left_out = (squares.sum() - squares - others / rest) / (rest - 1)
         whole = (squares.sum() - products.sum() / self.count) / (self.count - 1)

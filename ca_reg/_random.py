@@ -44,11 +44,12 @@ def draw_numbers(
 
 
 class PortableGenerator(torch.Generator):
-    """A generator whose numbers `draw_numbers` computes on the device that wants them, the same on every device.
+    """A generator whose numbers `draw_numbers` computes on the device that wants them.
 
-    The masks of a score come from it, so that nothing is drawn on the CPU and copied to a card. It counts: number i is
-    a hash of i and the seed (SplitMix64: Steele, Lea and Flood, "Fast splittable pseudorandom number generators",
-    2014). For whoever calls ``torch.rand(generator=...)`` it is a generator on the CPU with the same seed.
+    The draws of a score come from it, so that nothing is drawn on the CPU and copied to a card: masks are the same on
+    every device, normal numbers equal to rounding. It counts: number i is a hash of i and the seed (SplitMix64: Steele,
+    Lea and Flood, "Fast splittable pseudorandom number generators", 2014). For whoever calls
+    ``torch.rand(generator=...)`` it is a generator on the CPU with the same seed.
 
     Args:
         entropy: non-negative integers, which together are the seed.
@@ -68,7 +69,7 @@ class PortableGenerator(torch.Generator):
         self.manual_seed(self._seed >> 1)
 
     def numbers(self, sample: Callable[..., Tensor], n: int, device: torch.device | str | None) -> Tensor:
-        """Return the next n numbers of ``torch.rand`` or, equal to rounding, of ``torch.randn``; float32."""
+        """Return the next n numbers of ``torch.rand`` or ``torch.randn``, float32."""
         words = self._words(n, device)
         uniform = (words >> 40 & 0xFFFFFF).float() * 2**-24  # the upper 24 bits: what a float32 holds
         if sample is torch.rand:

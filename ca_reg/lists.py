@@ -227,9 +227,9 @@ class _Walk(NamedTuple):
         ranks = torch.empty_like(starts[1:]).scatter_(0, by_length, torch.arange(size, dtype=dtype, device=device))
         lengths = lengths.flip(0).cpu()  # the one wait for a GPU
         counts = size - torch.searchsorted(lengths, torch.arange(int(lengths[-1]), dtype=dtype), right=True)
-        offsets = counts.sum() - counts.cumsum(0)
+        offsets = (counts.sum() - counts.cumsum(0)).to(device, dtype, non_blocking=True)
         places = torch.arange(entries, dtype=dtype, device=device).sub_(starts.index_select(0, pixels))
-        target = offsets.to(device, dtype).index_select(0, places).add_(ranks.index_select(0, pixels))
+        target = offsets.index_select(0, places).add_(ranks.index_select(0, pixels))
         del pixels, places  # memory
         order = torch.empty_like(order).scatter_(0, target.long(), order)
         return cls(

@@ -144,7 +144,7 @@ def _leaves(points: Tensor, size: int) -> tuple[Tensor, Tensor]:
 def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
     """Return the distance from every point, (N, D), to the nearest of the others, (M, D); (N,), at least float32.
 
-    Among many others SciPy's k-d tree finds it, as in `nearest_neighbors`; else all distances are computed.
+    Among many others on a CPU SciPy's k-d tree finds it, as in `nearest_neighbors`; else all distances are computed.
 
     Raises:
         ValueError: if a shape is wrong, or there are no other points.
@@ -157,7 +157,7 @@ def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
         shapes = f"{tuple(points.shape)} and {tuple(others.shape)}"
         raise ValueError(f"expected points (N, D) and at least one other, (M, D), got {shapes}.")
     points, others = at_least_single(points), at_least_single(others)
-    if len(others) >= TREE_FROM:
+    if len(others) >= TREE_FROM and others.device.type == "cpu":
         with suppress(ImportError):
             from scipy.spatial import cKDTree
 

@@ -285,7 +285,8 @@ class CAScore:
         settings = self.settings
         assert settings.samples is not None
         assert settings.ddof is not None
-        moments, lowest, broken = RenderMoments(min(settings.samples, GROUPS)), torch.tensor(math.inf), False
+        moments, broken = RenderMoments(min(settings.samples, GROUPS)), False
+        lowest = x.opacities.new_full((), math.inf)
         differ: list[Tensor] = []
         for image, alpha in self._renders(self._drawn(x, index, settings.samples, differ), view):
             lowest = torch.minimum(lowest.to(alpha), alpha)

@@ -173,7 +173,7 @@ def _product_in_front(factors: Tensor) -> Tensor:
 
 def _per_splat(value: float | Tensor, alphas: Tensor, name: str) -> Tensor:
     """Return a moment of the multiplier as a tensor that broadcasts against the alphas."""
-    x = torch.as_tensor(value, dtype=alphas.dtype, device=alphas.device)
+    x = value.to(alphas) if isinstance(value, Tensor) else alphas.new_full((), value)
     if x.ndim > alphas.ndim or any(a not in (1, b) for a, b in zip(x.shape[::-1], alphas.shape[::-1], strict=False)):
         raise ValueError(
             f"the {name} of the multiplier must broadcast to the shape of alphas, {tuple(alphas.shape)}, got "

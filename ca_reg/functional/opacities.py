@@ -52,8 +52,15 @@ def draw_keep_mask(
         >>> keep.dtype, 750 < keep.sum() < 850
         (torch.bool, tensor(True))
     """
-    check_count(n, "n", minimum=0)
     check_rates(p)
+    return keep_mask(n, p, generator=generator, device=device)
+
+
+def keep_mask(
+    n: int, p: Rate, *, generator: torch.Generator | None = None, device: torch.device | str | None = None
+) -> Tensor:
+    """Draw as :func:`draw_keep_mask`, at rates that are known to be in [0, 1): reading them would wait for a card."""
+    check_count(n, "n", minimum=0)
     uniform = draw_numbers(torch.rand, n, generator, device)
     if isinstance(p, Tensor) and p.ndim:
         check_per_gaussian(p, uniform, "p")

@@ -50,13 +50,17 @@ class ClusteredDropout(Regularizer):
         super().__init__(p)
         self.k = k
         self.neighbors = Refreshed(every)
+        self._counted: tuple[Tensor, Tensor] | None = None  # neighbors; how many Gaussians are in 0, 1, ... clusters
 
     def anchor_rate(self, rate: Rate, neighbors: Tensor) -> Rate:
         """Return the rate of the anchors, given ``p`` at the step and the neighbor indices of all Gaussians, (N, k)."""
         # A Gaussian is dropped with its own cluster and with that of everyone whose neighbor it is: it stays if none of
         # its c anchors is drawn, so that the mean of stay^c over all Gaussians must be 1 - p.
-        clusters = 1 + neighbors.flatten().bincount(minlength=len(neighbors))
-        counts = clusters.bincount().double().cpu()
+        counted, counts = self._counted or (None, None)
+        if counts is None or counted is not neighbors:  # once in a search: a card is waited for
+            clusters = 1 + neighbors.flatten().bincount(minlength=len(neighbors))
+            counts = clusters.bincount().double().cpu()
+            self._counted = neighbors, counts
         sizes = torch.arange(len(counts)).to(counts)
         stay = 1.0
         for _ in range(30):  # Newton's method from above, monotone because the mean is convex in `stay`
@@ -75,8 +79,9 @@ class ClusteredDropout(Regularizer):
         neighbors = self.neighbors(x, lambda means: neighbors_of(means, self.k)[1])
         rate = self.anchor_rate(rate, neighbors)
         keep = functional.draw_keep_mask(count, rate, generator=generator, device=x.opacities.device)
-        keep = keep.index_fill(0, neighbors[~keep].flatten(), False)
-        return Draw(keep=keep)
+        # Those that go with nobody point behind the last: choosing the anchors' rows would wait for a card.
+        dropped = neighbors.masked_fill(keep[:, None], count).flatten()
+        return Draw(keep=torch.cat([keep, keep.new_zeros(1)]).index_fill(0, dropped, False)[:count])
 
     def replay(self, x: Params, draw: Draw) -> Params:
         """Set the opacities of dropped Gaussians to 0."""

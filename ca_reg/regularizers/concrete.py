@@ -96,7 +96,8 @@ def concrete_moments(logits: Rate, temperature: float, floor: float = 0.0) -> tu
     if not isinstance(logits, Tensor):
         mean, variance = concrete_moments(torch.tensor(logits, dtype=torch.float64), temperature, floor)
         return float(mean), float(variance)
-    t = torch.linspace(-3.25, 3.25, 53, dtype=torch.float64)  # up to where the weights fall below rounding
+    # Up to where the weights fall below rounding; on the device of the logits, as a copy would wait for a card.
+    t = torch.linspace(-3.25, 3.25, 53, dtype=torch.float64, device=logits.device)
     y = math.pi * t.sinh()
     s, complement = torch.sigmoid(y), torch.sigmoid(-y)
     span = 1.0 - 2.0 * floor

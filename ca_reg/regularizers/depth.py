@@ -74,6 +74,7 @@ class D2GSDropout(SurroundingsDropout):
         super().__init__(rate, every=every, scale=scale)
         self.depth_weight, self.density_weight = depth_weight, density_weight
         self.k, self.literal = k, literal
+        self.bounded = depth_weight + density_weight <= 1
         if literal:
             self.trained = _ByStepsAlone(every)
 
@@ -157,6 +158,7 @@ class DepthDropout(IndependentDropout):
         check_finite(far, "far", minimum=0.0)
         super().__init__(rate, scale=scale)
         self.near, self.far = near, far
+        self.bounded = max(near, far) <= 1
 
     def rates(self, x: Params) -> Rate:
         """Return the rates; 0 while the schedule is 0."""

@@ -7,6 +7,7 @@ import torch
 from ca_reg import functional
 from ca_reg._check import Rate, check_rate, is_zero, rate_like
 from ca_reg.functional import Multiplier
+from ca_reg.functional.opacities import keep_mask
 from ca_reg.regularizer import Draw, Params, Regularizer
 from ca_reg.schedules import LinearRamp, Schedule
 
@@ -25,6 +26,10 @@ class IndependentDropout(Regularizer):
         compensate: scale the survivors in training rather than all opacities in evaluation.
         scale: scale the opacities in evaluation, as the paper does; most published schemes do not.
 
+    Attributes:
+        bounded: whether the rates are in [0, 1) whatever ``x`` is. Others are checked at every draw, which waits for a
+            card.
+
     Example:
         >>> class DropFaint(IndependentDropout):
         ...     rate_name = "rate"
@@ -35,6 +40,7 @@ class IndependentDropout(Regularizer):
     """
 
     _check_rate = staticmethod(check_rate)
+    bounded: bool = False
 
     def __init__(self, rate: float | Schedule | None = None, *, compensate: bool = False, scale: bool = True) -> None:
         super().__init__(rate)
@@ -55,17 +61,16 @@ class IndependentDropout(Regularizer):
         rates = self.rates(x)
         if is_zero(rates):
             return Draw()
-        count, device = x.opacities.shape[0], x.opacities.device
-        keep = functional.draw_keep_mask(count, rates, generator=generator, device=device)
-        return Draw(keep=keep)
+        draw = keep_mask if self.bounded else functional.draw_keep_mask
+        return Draw(keep=draw(len(x.opacities), rates, generator=generator, device=x.opacities.device))
 
     def replay(self, x: Params, draw: Draw) -> Params:
         """Set the opacities of dropped Gaussians to 0; if asked to, compensate the others for the rates of ``x``."""
         if draw.keep is None:
             return x
-        # Only compensation needs the rates again; some are the ranks of a whole model.
-        rates = self.rates(x) if self.compensate else 0.0
-        opacities = functional.apply_dropout(x.opacities, draw.keep, p=rates, compensate=self.compensate)
+        opacities = functional.apply_dropout(x.opacities, draw.keep)
+        if self.compensate:  # which alone needs the rates again; some are the ranks of a whole model
+            opacities = opacities * (1.0 / (1.0 - rate_like(self.rates(x), x.opacities)))
         return x._replace(opacities=opacities)
 
     def expected(self, x: Params) -> Params:

@@ -131,6 +131,8 @@ class SurroundingsDropout(IndependentDropout):
 class RankedDropout(SurroundingsDropout):
     """Rates between two bounds, linear in the rank of a measurement: the base of density and geometry dropout."""
 
+    bounded = True
+
     def __init__(
         self,
         low: float = 0.2,
@@ -183,10 +185,13 @@ def relative_ranks(values: Tensor) -> Tensor:
     """
     if len(values) < 2:
         return torch.full_like(values, 0.5)
+    ordered, order = values.sort()
+    group = torch.zeros_like(order)  # equal values; `unique` would wait for a card
+    group[1:] = (ordered[1:] != ordered[:-1]).cumsum(0)
+    counts = torch.zeros_like(order).index_add_(0, group, torch.ones_like(order))
     # A group of equal values that ends at rank e and has c members shares the mean rank e - (c + 1) / 2, from 0.
-    _, places, counts = values.unique(return_inverse=True, return_counts=True)  # type: ignore[no-untyped-call]
-    ranks: Tensor = (2 * counts.cumsum(0) - counts - 1).to(values.dtype) / (2 * len(values) - 2)
-    return ranks[places]
+    ranks = (2 * counts.cumsum(0) - counts - 1).to(values.dtype) / (2 * len(values) - 2)
+    return torch.empty_like(values).scatter_(0, order, ranks[group])
 
 
 class DensityDropout(RankedDropout):

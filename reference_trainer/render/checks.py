@@ -17,8 +17,9 @@ from reference_trainer.camera import Camera
 from reference_trainer.render.constants import MAX_ROUNDING
 from reference_trainer.render.splats import Projected, Projection, Splats
 
-__all__ = ["NotFiniteError", "check_projection", "checked_background", "checked_colors", "numbers_to_check"]
-
+__all__ = [
+    "NotFiniteError", "add_background", "check_projection", "checked_background", "checked_colors", "numbers_to_check"
+]  # fmt: skip
 
 _finite: MutableMapping[Tensor, int | None] = WeakIdKeyDictionary()
 """Backgrounds that were found to be finite, by their version: to look again would be to wait for a card again."""
@@ -41,14 +42,27 @@ def numbers_to_check(
     return torch.cat([*sums, camera.world_to_camera.reshape(16)])
 
 
+def add_background(numbers: Tensor, background: Tensor) -> bool:
+    """Add a background that is new on this device to the numbers that are checked; return whether that was to do."""
+    if background.is_inference() or background.device != numbers.device:
+        return False
+    if new := _finite.get(background) != background._version:
+        numbers[1].add_(background.detach().sum())
+    return new
+
+
 @torch.no_grad()
 def check_projection(
-    numbers: Sequence[float], projected: Projected, inputs: Mapping[str, Tensor], camera: Camera
+    numbers: Sequence[float],
+    projected: Projected,
+    inputs: Mapping[str, Tensor],
+    camera: Camera,
+    background: Tensor | None = None,
 ) -> None:
     """Raise unless all numbers are finite and the world's coordinates not too large.
 
     Only if the numbers (of `Projected`, on the processor) add up to nan or infinity are the inputs
-    (of all Gaussians, by name) examined one by one.
+    (of all Gaussians, by name) examined one by one. Else the background, if one was added to them, is finite, too.
 
     Raises:
         NotFiniteError: if an input, which the message names, or a projection is nan or infinite.
@@ -60,6 +74,8 @@ def check_projection(
     far = max(abs(sum(view[4 * row + axis] * view[4 * row + 3] for row in range(3))) for axis in range(3))
     if not math.isfinite(total):
         _refuse((projection.means, projection.covariances, colors), inputs, camera)
+    elif background is not None:
+        _finite[background] = background._version
     share = far * len(colors) / depth if depth else 0.0  # in mean depths
     rounding = 0.5 * torch.finfo(colors.dtype).eps * share * max(camera.fx, camera.fy)
     if rounding > MAX_ROUNDING:

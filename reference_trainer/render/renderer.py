@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ca_reg.functional import Multiplier
 from reference_trainer.camera import Camera
-from reference_trainer.render.checks import check_projection, checked_background, checked_colors
+from reference_trainer.render.checks import add_background, check_projection, checked_background, checked_colors
 from reference_trainer.render.engine import engine_for
 from reference_trainer.render.splats import MomentImages, Rendering, Splats
 
@@ -41,6 +41,14 @@ def splat(
             the camera, or dropped, only position and opacity must be finite.
         NotImplementedError: if the camera's pose requires a gradient, which the engine torch alone computes.
     """
+    return _splat(means, quaternions, scales, opacities, camera, sh, sh_degree, colors, None)
+
+
+def _splat(
+    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, camera: Camera,
+    sh: Tensor | None, sh_degree: int | None, colors: Tensor | None, background: Tensor | None,
+) -> Splats:  # fmt: skip
+    """Do what `splat` does; a background is looked at with its numbers, without a further wait for a card."""
     values, degree = checked_colors(sh, sh_degree, colors)
     n = means.shape[0]
     if opacities.shape not in ((n,), (n, 1)):
@@ -57,7 +65,9 @@ def splat(
         camera = camera.to(means.device, inputs["means"].dtype)
         engine = engine_for(means.device, inputs["means"].dtype)
         projected = engine.project(inputs, camera, degree)
-        check = partial(check_projection, projected=projected, inputs=inputs, camera=camera)
+        if background is not None and not add_background(projected.numbers, background):
+            background = None
+        check = partial(check_projection, projected=projected, inputs=inputs, camera=camera, background=background)
         # Which tile a splat touches is a decision, not a quantity: nothing flows through the lists.
         with torch.no_grad():
             lists = engine.bin(projected, camera.width, camera.height, check)
@@ -117,7 +127,7 @@ def render(
         >>> out.image.shape, round(out.alpha.max().item(), 1)
         (torch.Size([3, 32, 32]), 0.8)
     """
-    splats = splat(means, quaternions, scales, opacities, camera, sh=sh, sh_degree=sh_degree, colors=colors)
+    splats = _splat(means, quaternions, scales, opacities, camera, sh, sh_degree, colors, background)
     return rasterize(splats, background=background, depth=depth)
 
 

@@ -4,6 +4,7 @@ from contextlib import nullcontext
 
 import pytest
 import torch
+from stand_ins.card import counted_synchronizations
 
 from ca_reg import CAMonitor, CAPenalty, CAScore, GaussianDropout, OpacityNoise, attribute
 from ca_reg.functional import Multiplier
@@ -66,7 +67,7 @@ def test_radii_of_dropped_gaussians_are_zeroed_there(scenes, card):
 
 @pytest.mark.parametrize("kind", ["protocol", "until it is known", "exact", "neutral"])
 def test_scores_are_those_of_the_processor(scenes, kind):
-    """Its masks do not depend on the device."""
+    """Its masks do not depend on the device, and nothing is copied to the card."""
     found = []
     for scene in scenes:
         score = {
@@ -75,8 +76,10 @@ def test_scores_are_those_of_the_processor(scenes, kind):
             "exact": lambda s: CAScore.exact(ListMoments(s.lists), threshold=0.1),
             "neutral": lambda s: CAScore.exact(ListMoments(s.lists), threshold=0.1, neutral=True),
         }[kind](scene)
-        score.update(scene.opacity, None)
+        with counted_synchronizations() as waits:
+            score.update(scene.opacity, None)
         found.append(score.compute().value)
+    assert waits["aten::copy_"] + waits["aten::_to_copy"] == {"exact": 1, "neutral": 2}.get(kind, 0)  # the lists' sizes
     assert found[0] > 0
     assert found[1] == pytest.approx(found[0], rel=1e-12)
 

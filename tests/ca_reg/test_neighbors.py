@@ -81,8 +81,9 @@ def test_half_precision_is_searched_in_single(monkeypatch, dtype, tree_from):
 
 def test_on_any_device(device):
     points = _points("clustered", 601)
+    there = points.to(device)
     with counted_synchronizations() as waits:
-        found, numbers = nearest_neighbors(points.to(device), 7)
+        found, numbers = nearest_neighbors(there, 7)
     assert waits.total() <= 1
     assert found.device.type == numbers.device.type == device.type
     _check(found.cpu(), numbers.cpu(), points, 7)
@@ -169,6 +170,16 @@ def test_the_nearest_of_other_points_equal_to_the_full_matrix(monkeypatch, tree,
     found = nearest_distance(points, others)
     assert found.dtype == points.dtype
     torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_the_nearest_distance_is_found_on_the_device(device):
+    points, others = _points("spread", 50), _points("clustered", neighbors.TREE_FROM)
+    there = points.to(device), others.to(device)
+    with counted_synchronizations() as waits:
+        found = nearest_distance(*there)
+    assert not waits
+    assert found.device.type == device.type
+    torch.testing.assert_close(found.cpu(), nearest_distance(points, others), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("shapes", [((4, 3), (5, 2)), ((4, 3), (0, 3)), ((4,), (4, 3))])

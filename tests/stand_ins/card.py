@@ -237,7 +237,7 @@ def _check(name: str, args: Sequence[Any], kwargs: Any, leaves: Sequence[Any], o
     for x in leaves:
         if isinstance(x, torch._C.Generator):
             check_generator(_generators.get(x._cdata, torch.device("cpu")), torch.device(device))
-    if ours and (name in SYNCHRONIZES or _leaves(name, args, kwargs) or _indexes_by_mask(name, args)):
+    if _crosses(name, args, kwargs) or (ours and (name in SYNCHRONIZES or _indexes_by_mask(name, args))):
         _count(name)
     if ours:
         check_supported(name, ours)
@@ -251,15 +251,18 @@ def _count(name: str) -> None:
         found[name] += 1
 
 
-def _leaves(name: str, args: Sequence[Any], kwargs: Any) -> bool:
-    """Whether this is a copy from the card to the processor that the host waits for.
+def _crosses(name: str, args: Sequence[Any], kwargs: Any) -> bool:
+    """Whether this is a copy between the processor and the card that the host waits for.
 
-    A tensor that PyTorch makes for a copy with ``non_blocking`` is pinned, and nothing waits for it.
+    With ``non_blocking`` it does not, unless the copy goes to a tensor on the processor that was there before: one that
+    PyTorch makes is pinned.
     """
     if name == "aten::copy_":
-        return not isinstance(args[0], CardTensor)
-    device = kwargs.get("device")
-    return name == "aten::_to_copy" and not kwargs.get("non_blocking") and device is not None and not _is_card(device)
+        arrives, free = isinstance(args[0], CardTensor), kwargs.get("non_blocking") or any(args[2:])
+        return arrives != isinstance(args[1], CardTensor) and not (arrives and free)
+    if name != "aten::_to_copy" or kwargs.get("device") is None or kwargs.get("non_blocking"):
+        return False
+    return isinstance(args[0], CardTensor) != _is_card(kwargs["device"])
 
 
 def _indexes_by_mask(name: str, args: Sequence[Any]) -> bool:

@@ -4,6 +4,7 @@ import itertools
 
 import pytest
 import torch
+from stand_ins.card import counted_synchronizations
 
 from ca_reg import Params
 from ca_reg.neighbors import TREE_FROM
@@ -35,6 +36,32 @@ def test_draw_and_test_time_value_are_those_of_the_cpu(name, device):
             x, y = getattr(here, field), getattr(there, field)
             assert y.device.type == device.type, field
             torch.testing.assert_close(y.cpu(), x)
+
+
+@pytest.mark.parametrize(
+    "text", [*REGULARIZERS, "density(compensate=True)", "d2gs(literal=True)", "soft(by_size=True)"]
+)
+def test_a_warm_step_does_not_wait_for_the_card(text, card):
+    chain = parse(text + ARGUMENTS.get(text, ""))
+    x, radii = params(chain, card), torch.ones(N, device=card)
+    for step in range(3_001, 3_005):  # neighbors are sought in the first
+        opacities = x.opacities.clone().requires_grad_()
+        chain.set_step(step)
+        with counted_synchronizations() as found:
+            out = chain(x._replace(opacities=opacities, step=step))
+            if out.opacities.requires_grad:
+                out.opacities.sum().backward()
+            chain.mask_radii(radii)
+    assert not found, found
+
+
+@pytest.mark.parametrize("name", list(REGULARIZERS))
+def test_the_test_time_value_copies_nothing_to_the_card(name, card):
+    chain = parse(name + ARGUMENTS.get(name, "")).eval()
+    x = params(chain, card)
+    with counted_synchronizations() as found:
+        chain(x)
+    assert not {"aten::copy_", "aten::_to_copy"} & set(found), found
 
 
 @pytest.mark.parametrize("name", list(REGULARIZERS))

@@ -6,9 +6,12 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from subprocesses import subprocess_environment
 
 pytest.importorskip("triton")
+from benchmarks.counts import _counted
+
 ROOT = Path(__file__).parents[4]
 CODE = """
 import json
@@ -16,6 +19,21 @@ from benchmarks.counts import bytes_per_entry, count_exact_score
 rows = [count_exact_score(*size)._asdict() for size in ((16, 12, 0.05), (40, 30, 0.1))]
 print(json.dumps({"rows": rows, "bytes": bytes_per_entry()}))
 """
+
+
+@pytest.mark.parametrize(
+    ("read", "count"),
+    [
+        (lambda x: (x + 1).cpu().tolist(), 1),
+        (lambda x: int((x + 1).cpu()[-1]), 1),
+        (lambda x: (read := (x + 1).cpu(), int(read[-1]), read.tolist()), 1),
+        (lambda x: ((x + 1).tolist(), int(x[-1]), x.nonzero()), 3),
+        (lambda x: x * 2, 0),
+    ],
+)
+def test_a_number_is_read_back_once(read, count):
+    x = torch.ones(3)
+    assert _counted(lambda: read(x))[1].read_backs == count
 
 
 @pytest.mark.slow
