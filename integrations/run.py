@@ -32,7 +32,7 @@ from ca_reg.schedules import LinearRamp, Schedule, StartStop
 from ._calls import MODULES
 from ._report import Hook
 from ._scripts import (
-    Watch,
+    ScriptAudit,
     explain_download,
     find_script,
     folder_of_reports,
@@ -68,9 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             name = ["-m", options.script] if options.module else [str(options.script.resolve())]
             own = arguments[: len(arguments) - len(options.arguments) - (2 if options.module else 1)]
             undo.enter_context(in_children(f"{__package__}.run:resume", own, name))
-        watch = undo.enter_context(Watch())
+        audit = undo.enter_context(ScriptAudit())
         undo.enter_context(old_aliases())
-        undo.enter_context(_reported(options, hook, watch))
+        undo.enter_context(_reported(options, hook, audit))
         if options.cpu:
             from reference_trainer.compat import stand_in
 
@@ -216,7 +216,7 @@ def _hook(options: argparse.Namespace) -> Hook | None:
 
 
 @contextmanager
-def _reported(options: argparse.Namespace, hook: Hook | None, watch: Watch) -> Iterator[None]:
+def _reported(options: argparse.Namespace, hook: Hook | None, audit: ScriptAudit) -> Iterator[None]:
     """Report what was done, however the script ends; exit with 1 if that is not what was asked for."""
     ended, problem = "finished", None
     try:
@@ -229,7 +229,7 @@ def _reported(options: argparse.Namespace, hook: Hook | None, watch: Watch) -> I
             raise
     except BaseException as error:
         ended = f"{type(error).__name__}: {error}".rstrip(": ")
-        problem = _explain_failure(error, options, watch)
+        problem = _explain_failure(error, options, audit)
         raise
     finally:
         started = reports_of_children()
@@ -245,7 +245,7 @@ def _reported(options: argparse.Namespace, hook: Hook | None, watch: Watch) -> I
         for child in started:
             done = "; ".join(child.get("done", ["nothing"]))
             lines.append(f"{child['script']}, a process that it started: {done}")
-        lines += [f"WARNING: a process that it started was not hooked: {command}" for command in watch.missed]
+        lines += [f"WARNING: a process that it started was not hooked: {command}" for command in audit.missed]
         for line in [*lines, *([f"ERROR: {problem}"] if problem else [])]:
             print(f"[ca_reg] {line}", file=sys.stderr)
         if options.report is not None:
@@ -263,7 +263,7 @@ def _problem(hook: Hook | None) -> str | None:
     return own or next((f"{child['script']}: {child['problem']}" for child in children if child["problem"]), None)
 
 
-def _explain_failure(error: BaseException, options: argparse.Namespace, watch: Watch) -> str | None:
+def _explain_failure(error: BaseException, options: argparse.Namespace, audit: ScriptAudit) -> str | None:
     """Say what to do about an exception of the script, where the launcher knows."""
     if isinstance(error, ModuleNotFoundError) and options.cpu:
         name = str(error.name)
@@ -273,7 +273,7 @@ def _explain_failure(error: BaseException, options: argparse.Namespace, watch: W
             f"There is no module {name}: install it, {named}or put a file in its place, beside the script, with what "
             "that calls of it"
         )
-    return explain_download(error, options.sources.root.resolve(), watch.saved)
+    return explain_download(error, options.sources.root.resolve(), audit.saved)
 
 
 if __name__ == "__main__":
