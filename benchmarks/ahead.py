@@ -90,8 +90,8 @@ def _photometric(label: str, **constants: Any) -> list[Kernel]:
     block = {"WIDE": 32, "HIGH": 16}
     expected = {"EXPECTED": constants["EXPECTED"]}
     return [
-        Kernel(f"{label}, rows", _ssim_triton.blur_pictures, expected | block, 8, walks=False),
-        Kernel(f"{label}, columns", _ssim_triton.compare_pictures, constants | block, 8, walks=False),
+        Kernel(f"{label}, rows", _ssim_triton.blur_images, expected | block, 8, walks=False),
+        Kernel(f"{label}, columns", _ssim_triton.compare_images, constants | block, 8, walks=False),
         Kernel(f"{label} backward, rows", _ssim_triton.blur_slopes, block, 8, walks=False),
         Kernel(f"{label} backward, columns", _ssim_triton.gather_gradients, constants | block, 8, walks=False),
     ]

@@ -6,7 +6,7 @@ python -m benchmarks.attribution RUN --split test --drop-rate 0.5
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -61,7 +61,6 @@ def study_attribution(
     split: str = "test",
     drop_rate: float = 0.5,
     device: str = "cpu",
-    say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """Attribute the exact score of a run; write the shares, colored PLYs, pictures and a table, and print the table.
 
@@ -71,7 +70,6 @@ def study_attribution(
         split: the views to use, ``"train"`` or ``"test"``.
         drop_rate: of the score.
         device: where to render.
-        say: receives the table.
 
     Returns:
         The content of ``attribution.json``.
@@ -127,8 +125,8 @@ def study_attribution(
     write_json(out / "attribution.json", data)
     table = _table(data)
     write_text(out / "README.md", _README.format(table=table, ca_range=CA_PICTURE_RANGE, **scales))
-    say(table)
-    say(f"Shares, PLYs and pictures are in {out}; README.md there says what the colors mean")
+    print(table)
+    print(f"Shares, PLYs and pictures are in {out}; README.md there says what the colors mean")
     return data
 
 

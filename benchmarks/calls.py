@@ -17,40 +17,40 @@ from reference_trainer.renderers.gsplat import load_gsplat_render
 from reference_trainer.studies.stability.quantities import render_simply
 from reference_trainer.studies.study import Clock, now
 
-__all__ = ["BASELINE", "PASSES", "Draw", "draw_of", "gradients", "image", "others_on", "processor_clock"]
+__all__ = ["BASELINE", "PASSES", "Render", "gradients", "image", "others_on", "processor_clock", "render_with"]
 
 PASSES = ("forward", "forward+backward")
 
-Draw = Callable[[Mapping[str, Tensor], Camera], Tensor]
+Render = Callable[[Mapping[str, Tensor], Camera], Tensor]
 """From the five tensors of the Gaussians and a camera to an image (3, H, W)."""
 
 
-def draw_of(engine: str) -> Draw:
+def render_with(engine: str) -> Render:
     """Return one of the engines of the renderer as something to time."""
 
-    def draw(parameters: Mapping[str, Tensor], camera: Camera) -> Tensor:
-        with using_engine(engine):  # projection and drawing; the gradient goes through what they have chosen
+    def rendered(parameters: Mapping[str, Tensor], camera: Camera) -> Tensor:
+        with using_engine(engine):  # projection and rendering; the gradient goes through what they have chosen
             return render(**parameters, camera=camera).image
 
-    return draw
+    return rendered
 
 
 def _simply(parameters: Mapping[str, Tensor], camera: Camera) -> Tensor:
     return render_simply(**parameters, camera=camera)
 
 
-BASELINE: Draw = _simply
+BASELINE: Render = _simply
 """The frozen simple renderer."""
 
 
-def others_on(device: torch.device) -> dict[str, Draw]:
+def others_on(device: torch.device) -> dict[str, Render]:
     """Return what is timed beside the baseline: the engines, and gsplat where it and a CUDA device exist.
 
     Example:
         >>> list(others_on(torch.device("cpu")))
         ['numba', 'torch']
     """
-    found = {engine: draw_of(engine) for engine in engines_on(device)}
+    found = {engine: render_with(engine) for engine in engines_on(device)}
     try:
         gsplat = load_gsplat_render(device)
     except (ImportError, RuntimeError):
@@ -59,21 +59,21 @@ def others_on(device: torch.device) -> dict[str, Draw]:
 
 
 @torch.no_grad()
-def image(draw: Draw, workload: Workload) -> Tensor:
+def image(render_fn: Render, workload: Workload) -> Tensor:
     """Render a workload without keeping anything for gradients: what "forward" times, shape (3, H, W)."""
-    return draw(workload.parameters, workload.camera)
+    return render_fn(workload.parameters, workload.camera)
 
 
-def gradients(draw: Draw, workload: Workload) -> dict[str, Tensor]:
+def gradients(render_fn: Render, workload: Workload) -> dict[str, Tensor]:
     """Return the gradients of the mean squared error to the target: what "forward+backward" times.
 
     Example:
         >>> from benchmarks.workloads import WorkloadSpec
-        >>> sorted(gradients(draw_of("torch"), WorkloadSpec(20, 16, 16, 0.1).make()))
+        >>> sorted(gradients(render_with("torch"), WorkloadSpec(20, 16, 16, 0.1).make()))
         ['colors', 'means', 'opacities', 'quaternions', 'scales']
     """
     leaves = {name: x.detach().requires_grad_() for name, x in workload.parameters.items()}
-    loss = (draw(leaves, workload.camera) - workload.target).square().mean()
+    loss = (render_fn(leaves, workload.camera) - workload.target).square().mean()
     return dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
 
 

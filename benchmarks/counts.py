@@ -218,12 +218,12 @@ def count_exact_score(count: int, width: int, scale: float, device: torch.device
     score()  # loads what is loaded once
     splats = splat(means, quaternions, scales, opacities, model.camera, colors=colors)
     inputs = {"means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities, "colors": colors}
-    multiplier, behind = torch.full((count, 2), 0.25, device=device), torch.zeros(3, width, width, device=device)
+    multiplier, background = torch.full((count, 2), 0.25, device=device), torch.zeros(3, width, width, device=device)
 
     def rendering() -> Any:
         projected = splats.engine.project(inputs, model.camera, None)
         lists = splats.engine.bin(projected, width, width, lambda numbers: None)
-        return splats.engine.moments(Splats(*projected[:4], lists, splats.engine), multiplier, behind)
+        return splats.engine.moments(Splats(*projected[:4], lists, splats.engine), multiplier, background)
 
     operations, mode, _ = _counted(score)
     return Counts(operations, _counted(rendering)[0], mode.read_backs, len(splats.lists.gaussians))

@@ -337,8 +337,8 @@ def ranked(views: Mapping[str, Sequence[Quality]], first: str, second: str) -> d
     return found
 
 
-def draw(runs: Mapping[str, str], file: Path) -> None:
-    """Draw the last test view of every run: render, measured error, expected error, and what no photograph shows."""
+def plot(runs: Mapping[str, str], file: Path) -> None:
+    """Plot the last test view of every run: render, measured error, expected error, and what no photograph shows."""
     with new_figure(file) as figure:
         figure.set_size_inches(WIDTH, 1.75 * len(runs) + 0.3)
         axes = figure.subplots(len(runs), 4, squeeze=False)
@@ -370,7 +370,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     if options.picture:
-        draw(dict(each.split("=", 1) for each in options.runs), options.picture)
+        plot(dict(each.split("=", 1) for each in options.runs), options.picture)
         return
     if not options.runs:
         print(tables(json.loads(options.rows.read_text("utf-8"))))

@@ -53,13 +53,13 @@ def sheets(models: Sequence[TrainedModel], labels: Sequence[str], path: Sequence
 
     width, height = path[0].width, path[0].height
     font = label_font()
-    drawn, scores = list[list[tuple[Image.Image, Image.Image]]](), list[str]()
+    columns, scores = list[list[tuple[Image.Image, Image.Image]]](), list[str]()
     for model in models:
         score = model.exact_ca_score(drop_rate=0.5)
         views = [Viewpoint("", camera) for camera in path]
         results = [score(model.gaussians.opacities, view) for view in views]
         renders = [as_pillow(model.test_rendering(view).image) for view in views]
-        drawn.append(
+        columns.append(
             list(
                 zip(renders, (as_pillow(heat_map(r.variance.float(), CA_PICTURE_RANGE)) for r in results), strict=True)
             )
@@ -80,7 +80,7 @@ def sheets(models: Sequence[TrainedModel], labels: Sequence[str], path: Sequence
     pictures = []
     for number in range(len(path)):
         pictures.append(sheet.copy())
-        for i, of in enumerate(drawn):
+        for i, of in enumerate(columns):
             for row, picture in enumerate(of[number]):
                 pictures[-1].paste(picture, (i * (width + _GAP), _HEAD + row * (_HEAD + height)))
     return pictures

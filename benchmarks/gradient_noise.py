@@ -26,6 +26,7 @@ from benchmarks.gradient_noise_moments import (
     dot,
 )
 from ca_reg.functional import Multiplier, apply_dropout, draw_keep_mask, expected_squared_error
+from reference_trainer.cli import log_shown
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.rendering import render_gaussians, render_moments_of
@@ -128,7 +129,7 @@ def gradient_noise_table(result: GradientNoise) -> str:
 
 
 def gradient_noise_figure(results: Mapping[str, GradientNoise], figure: Any) -> None:
-    """Draw the relative noise of a sampled and of an analytic step for every group, one panel per run.
+    """Plot the relative noise of a sampled and of an analytic step for every group, one panel per run.
 
     Args:
         results: by the title of the panel.
@@ -171,7 +172,8 @@ def main(
         dropout: rate of the masks.
         device: "cpu" or "cuda".
     """
-    run_study(gradient_noise_study(runs, draws=draws, dropout=dropout, device=device), out)
+    with log_shown():
+        run_study(gradient_noise_study(runs, draws=draws, dropout=dropout, device=device), out)
 
 
 def gradient_noise_study(runs: Sequence[Path], *, draws: int = 64, dropout: float = 0.2, device: str = "cpu") -> Study:

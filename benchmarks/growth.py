@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -18,7 +18,7 @@ import numpy as np
 import torch
 import tyro
 
-from benchmarks.calls import PASSES, draw_of, gradients, image, processor_clock
+from benchmarks.calls import PASSES, gradients, image, processor_clock, render_with
 from benchmarks.memory import peak_memory
 from benchmarks.workloads import WORKLOADS, WorkloadSpec, covered_pairs
 from reference_trainer.evaluation.results import machine, write_json
@@ -283,18 +283,18 @@ def _row(unit: str, point: Mapping[str, Any]) -> dict[str, object]:
 
 
 def growth_figure(report: Mapping[str, Any], path: Path) -> None:
-    """Draw times above and memory below, one column per axis, with the fitted lines.
+    """Plot times above and memory below, one column per axis, with the fitted lines.
 
     Args:
         report: what `measure_growth` returns.
         path: the PNG to write.
     """
     with new_figure(path) as figure:
-        _draw(report["axes"], figure)
+        _plot(report["axes"], figure)
 
 
-def _draw(axes: Mapping[str, Any], figure: Any) -> None:
-    """Draw all axes."""
+def _plot(axes: Mapping[str, Any], figure: Any) -> None:
+    """Plot all axes."""
     figure.set_size_inches(4.2 * len(axes), 7.5)
     panels = figure.subplots(2, len(axes), squeeze=False, sharex="col")
     for column, axis in enumerate(axes.values()):
@@ -338,7 +338,7 @@ def growth(
         repeats: rounds of which the medians are taken.
         time_limit: seconds that one point may take; larger ones are left out, with the reason.
         device: where to render, "cpu" or "cuda".
-        engine: what draws; the limit stops both at what is too slow for one.
+        engine: what renders; the limit stops both at what is too slow for one.
     """
     only = {} if engine == "all" else {"engines": (engine,)}
     measure_growth(growth_axes(largest), out, repeats=repeats, time_limit=time_limit, device=device, **only)
@@ -352,7 +352,6 @@ def measure_growth(
     time_limit: float = 300.0,
     device: str = "cpu",
     engines: Sequence[str] = (),
-    say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """Measure the workloads of every axis; see `growth`.
 
@@ -372,13 +371,13 @@ def measure_growth(
         """Measure, or take what was measured with the same settings; leave out what is expected to take too long."""
         wanted = {"spec": asdict(spec), **settings}
         if measured.get(name, {}).get("settings") == wanted:
-            say(f"{name}: measured before, kept")
+            print(f"{name}: measured before, kept")
         elif expected > time_limit:
             reason = f"it would take about {expected:.2g} s, extrapolated; the limit is {time_limit:g} s"
-            say(f"{name}: left out, {reason}")
+            print(f"{name}: left out, {reason}")
             return {"skipped": reason}
         else:
-            say(f"{name}: {spec.gaussians} Gaussians, {spec.width}x{spec.height}")
+            print(f"{name}: {spec.gaussians} Gaussians, {spec.width}x{spec.height}")
             measured[name] = {"settings": wanted, **_measure(spec, engines, repeats=repeats, device=place)}
             write_json(file, {"measured": measured})
         return {key: value for key, value in measured[name].items() if key != "settings"}
@@ -404,7 +403,7 @@ def measure_growth(
     write_json(file, report)
     write_text(out / TABLE, growth_tables(report))
     growth_figure(report, out / FIGURE)
-    say(growth_tables(report))
+    print(growth_tables(report))
     return report
 
 
@@ -432,10 +431,10 @@ def extrapolated(seconds: Mapping[float, float], x: float) -> float:
 
 
 def _measure(spec: WorkloadSpec, engines: Sequence[str], *, repeats: int, device: torch.device) -> dict[str, Any]:
-    """Measure times and memory of a workload, drawn by every engine."""
+    """Measure times and memory of a workload, rendered by every engine."""
     workload = spec.make().to(device)
     calls = {
-        (engine, x): partial(call, draw_of(engine), workload)
+        (engine, x): partial(call, render_with(engine), workload)
         for engine in engines
         for x, call in zip(PASSES, (image, gradients), strict=True)
     }

@@ -9,7 +9,7 @@ from unittest import mock
 
 import torch
 
-from benchmarks.calls import draw_of, gradients, image
+from benchmarks.calls import gradients, image, render_with
 from benchmarks.workloads import WorkloadSpec
 from reference_trainer.runs.executors import Failure, Processes, Task, run_all
 
@@ -29,7 +29,7 @@ def peak_memory(spec: WorkloadSpec, engine: str, device: torch.device) -> dict[s
 
     Args:
         spec: of the workload.
-        engine: what draws.
+        engine: what renders.
         device: where to render.
 
     Returns:
@@ -54,13 +54,13 @@ def peak_memory(spec: WorkloadSpec, engine: str, device: torch.device) -> dict[s
 def _in_this_process(spec: WorkloadSpec, engine: str, device: str, threads: int) -> dict[str, int]:
     """Measure here; nothing larger may have been rendered in this process before."""
     torch.set_num_threads(threads)
-    draw, workload = draw_of(engine), spec.make().to(device)
-    gradients(draw, _TINY.make().to(device))
+    render_fn, workload = render_with(engine), spec.make().to(device)
+    gradients(render_fn, _TINY.make().to(device))
     before = _restart(workload.means.device)
-    image(draw, workload)
+    image(render_fn, workload)
     forward = _peak(workload.means.device) - before
     before = _restart(workload.means.device)
-    gradients(draw, workload)
+    gradients(render_fn, workload)
     return {"forward": forward, "forward+backward": _peak(workload.means.device) - before}
 
 

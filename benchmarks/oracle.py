@@ -19,6 +19,7 @@ from kornia.filters import spatial_gradient
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
+from reference_trainer.cli import log_shown
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.shares import blend_weights, mean_shares, share_per_weight
 from reference_trainer.evaluation.tables import markdown_table, mean_std
@@ -65,13 +66,14 @@ def main(
         out: folder for the JSON, the tables and the figure.
         steps: of the search for the best factors of the opacities.
     """
-    run_study(oracle_study(runs, steps=steps), out)
+    with log_shown():
+        run_study(oracle_study(runs, steps=steps), out)
 
 
 def oracle_study(runs: Sequence[Path], *, steps: int = 30) -> Study:
     """Declare the study: a case for each run."""
     cases = {name: {"checkpoint": path, "steps": steps} for name, path in checkpoints(runs).items()}
-    return Study("oracle", _measure, cases, _report, _draw)
+    return Study("oracle", _measure, cases, _report, _plot)
 
 
 def held(error: Tensor, predictor: Tensor, parts: Sequence[float]) -> list[float]:
@@ -256,8 +258,8 @@ def _report(records: Records) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _draw(records: Records, figure: Any) -> None:
-    """Draw, in a row for each run, where the error is, and what is gained by removing and by halving."""
+def _plot(records: Records, figure: Any) -> None:
+    """Plot, in a row for each run, where the error is, and what is gained by removing and by halving."""
     figure.set_size_inches(13, 3.6 * len(records))
     grid = figure.subplots(len(records), 3, squeeze=False)
     for (run, record), (left, *panels) in zip(records.items(), grid, strict=True):

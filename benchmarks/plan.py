@@ -18,6 +18,7 @@ from torch import Tensor
 
 from benchmarks.calls import processor_clock
 from benchmarks.memory import PROCESS, process_status
+from reference_trainer.cli import log_shown
 from reference_trainer.evaluation.evaluate import evaluate
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 from reference_trainer.model.rendering import render_gaussians
@@ -120,7 +121,8 @@ def plan(
     """
     study = plan_study(scene, config=config, iterations=steps, seeds=seeds, alternatives=alternatives, device=device)
     # Every training has a fresh process, one after the other, because time and peak memory are measured.
-    run_study(study, out, executor=Processes(1))
+    with log_shown():
+        run_study(study, out, executor=Processes(1))
 
 
 def shortened(config: TrainConfig, iterations: int) -> TrainConfig:

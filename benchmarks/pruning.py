@@ -16,6 +16,7 @@ import torch
 import tyro
 from torch import Tensor
 
+from reference_trainer.cli import log_shown
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.shares import blend_weights, mean_shares, share_per_weight
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
@@ -67,7 +68,8 @@ def main(
         refine: steps of further training after pruning, without densification; 0 for none.
         device: "cpu" or "cuda".
     """
-    run_study(pruning_study(runs, fractions=fractions, refine=refine, device=device), out)
+    with log_shown():
+        run_study(pruning_study(runs, fractions=fractions, refine=refine, device=device), out)
 
 
 def pruning_order(model: TrainedModel, views: Sequence[View], *, generator: torch.Generator) -> dict[str, Tensor]:
@@ -161,7 +163,7 @@ def pruning_study(
         }
         for run, checkpoint in found.items() for criterion, fraction in variants for steps in sorted({0, refine})
     }  # fmt: skip
-    return Study("pruning", _measure, cases, _report, _draw)
+    return Study("pruning", _measure, cases, _report, _plot)
 
 
 def _refuse_different(folders: Sequence[Path]) -> None:
@@ -248,8 +250,8 @@ def _report(records: Records) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _draw(records: Records, figure: Any) -> None:
-    """Draw PSNR and exact score against the fraction, a line per criterion, a row for each number of steps."""
+def _plot(records: Records, figure: Any) -> None:
+    """Plot PSNR and exact score against the fraction, a line per criterion, a row for each number of steps."""
     groups = _over_runs(records)
     rows = sorted({steps for _, _, steps in groups})
     figure.set_size_inches(10, 3.8 * len(rows))

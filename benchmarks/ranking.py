@@ -20,6 +20,7 @@ from torch import Tensor
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier
 from ca_reg.types import read_moments
+from reference_trainer.cli import log_shown
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.style import WIDTH, color, readable
 from reference_trainer.evaluation.tables import markdown_table, mean_std
@@ -138,7 +139,8 @@ def main(
         views: only the first so many.
         device: "cpu" or "cuda".
     """
-    run_study(ranking_study(runs, split=split, views=views, device=device), out)
+    with log_shown():
+        run_study(ranking_study(runs, split=split, views=views, device=device), out)
 
 
 def ranking_study(runs: Sequence[Path], *, split: str = "test", views: int | None = None, device: str = "cpu") -> Study:
@@ -160,7 +162,7 @@ def ranking_study(runs: Sequence[Path], *, split: str = "test", views: int | Non
         raise ValueError(f"views must be at least 1, or None for all, got {views}.")
     settings = {"split": split, "views": views, "device": device}
     cases = {name: {"checkpoint": file, **settings} for name, file in checkpoints(runs).items()}
-    return Study("ranking", _measure, cases, _report, _draw)
+    return Study("ranking", _measure, cases, _report, _plot)
 
 
 def _measure(checkpoint: Path, split: str, views: int | None, device: str) -> Record:
@@ -339,8 +341,8 @@ def _report(records: Records) -> str:
 _DRAWN = {"protocol_half": ("CA of 5 renders", _FIVE_OF_LIMIT), "neutral_half": ("neutral exact CA", 1.0)}
 
 
-def _draw(records: Records, figure: Any) -> None:
-    """Draw the protocol and the neutral score against the exact one, all at drop rate 1/2; a row for each scene."""
+def _plot(records: Records, figure: Any) -> None:
+    """Plot the protocol and the neutral score against the exact one, all at drop rate 1/2; a row for each scene."""
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
     scenes = _scenes(records)

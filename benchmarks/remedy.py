@@ -23,6 +23,7 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
+from reference_trainer.cli import log_shown
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 from reference_trainer.runs.run import model_of
@@ -79,7 +80,8 @@ def main(
     if views == "table":
         print("\n".join(overview(json.loads(Path(file).read_text("utf-8"))["records"], reference) for file in arms))
         return
-    run_study(remedy_study(views, arms, scenes=scenes, seeds=seeds, data=data), out)
+    with log_shown():
+        run_study(remedy_study(views, arms, scenes=scenes, seeds=seeds, data=data), out)
 
 
 def arm(text: str) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from benchmarks.calls import BASELINE, PASSES, Draw, draw_of, gradients, image, others_on, processor_clock
+from benchmarks.calls import BASELINE, PASSES, Render, gradients, image, others_on, processor_clock, render_with
 from benchmarks.memory import peak_memory
 from benchmarks.speed_report import regressions, speed_tables
 from benchmarks.stages import STAGES, Staged, staged
@@ -70,7 +70,6 @@ def measure_speed(
     repeats: int = 7,
     against: Path | None = None,
     device: str = "cpu",
-    say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """Measure workloads of any size; see `speed`.
 
@@ -89,9 +88,9 @@ def measure_speed(
     place = torch.device(device)
     results = {}
     for name, spec in specs.items():
-        say(f"{name}: {spec.gaussians} Gaussians, {spec.width}x{spec.height}")
+        print(f"{name}: {spec.gaussians} Gaussians, {spec.width}x{spec.height}")
         results[name] = _workload(spec, repeats, place)
-    say(f"training steps of {scene.name}")
+    print(f"training steps of {scene.name}")
     training = _training(scene, repeats, place)
     report = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -107,36 +106,37 @@ def measure_speed(
     }
     write_json(out / REPORT, report)
     write_text(out / TABLE, speed_tables(report))
-    say(speed_tables(report))
+    print(speed_tables(report))
     if old is not None and (lines := regressions(report, old)):
         raise RuntimeError(f"{len(lines)} numbers are worse than in {against}:\n" + "\n".join(f"  {x}" for x in lines))
     return report
 
 
 def _workload(spec: WorkloadSpec, repeats: int, device: torch.device) -> dict[str, Any]:
-    """Measure everything that draws a workload, in turns."""
+    """Measure everything that renders a workload, in turns."""
     workload, clock, engines = spec.make().to(device), processor_clock(device), engines_on(device)
-    draws = {**others_on(device), "baseline": BASELINE}
+    renders = {**others_on(device), "baseline": BASELINE}
     runs: dict[str, list[Staged]] = {engine: [] for engine in engines}
 
     def in_stages(engine: str) -> None:
         runs[engine].append(staged(workload, engine, clock))
 
     calls: dict[str, Callable[[], object]] = {}
-    for name, draw in draws.items():
+    for name, render_fn in renders.items():
         calls |= {
-            f"{name}: {x}": partial(call, draw, workload) for x, call in zip(PASSES, (image, gradients), strict=True)
+            f"{name}: {x}": partial(call, render_fn, workload)
+            for x, call in zip(PASSES, (image, gradients), strict=True)
         }
     for engine in engines:
         calls[f"{engine}: stages"] = partial(in_stages, engine)
         calls |= {f"{engine}: {what}": call for what, call in scores(workload, engine).items()}
     seconds = in_turns(calls, repeats, clock)
-    pairs = {f"{name}: {x} / baseline": (f"{name}: {x}", f"baseline: {x}") for name in draws for x in PASSES}
+    pairs = {f"{name}: {x} / baseline": (f"{name}: {x}", f"baseline: {x}") for name in renders for x in PASSES}
     what = ("exact score", f"score, K = {MASKS}")
     pairs |= {f"{e}: {x} / render": (f"{e}: {x}", f"{e}: render") for e in engines for x in what}
     ratios = {name: _ratio(seconds, a, b) for name, (a, b) in pairs.items() if a != b}
     if device.type == "cpu":
-        ratios |= {f"{e}: two threads / one": _two_threads(draw_of(e), workload, repeats) for e in engines}
+        ratios |= {f"{e}: two threads / one": _two_threads(render_with(e), workload, repeats) for e in engines}
     return {
         "gaussians": spec.gaussians,
         "width": spec.width,
@@ -147,17 +147,17 @@ def _workload(spec: WorkloadSpec, repeats: int, device: torch.device) -> dict[st
         "entries": {e: runs[e][0].entries for e in engines},
         "memory": {e: peak_memory(spec, e, device) for e in engines},
         "ratios": ratios,
-        "errors": {f"{e}: {x}": y for e in engines for x, y in _errors(draw_of(e), workload).items()},
+        "errors": {f"{e}: {x}": y for e in engines for x, y in _errors(render_with(e), workload).items()},
     }
 
 
-def _two_threads(draw: Draw, workload: Workload, repeats: int) -> float:
+def _two_threads(render_fn: Render, workload: Workload, repeats: int) -> float:
     """Return the wall-clock time of a gradient with two threads over that with one."""
     before = torch.get_num_threads()
 
     def with_threads(count: int) -> None:
         torch.set_num_threads(count)
-        gradients(draw, workload)
+        gradients(render_fn, workload)
 
     try:
         calls = {str(count): partial(with_threads, count) for count in (1, 2)}
@@ -166,13 +166,13 @@ def _two_threads(draw: Draw, workload: Workload, repeats: int) -> float:
         torch.set_num_threads(before)
 
 
-def _errors(draw: Draw, workload: Workload) -> dict[str, float]:
+def _errors(render_fn: Render, workload: Workload) -> dict[str, float]:
     """Return errors against float64: absolute of the image, of gradients the norm of the error over the norm."""
     precise = workload.to(dtype=torch.float64)
-    difference = (image(draw, workload).double() - image(BASELINE, precise)).abs()
+    difference = (image(render_fn, workload).double() - image(BASELINE, precise)).abs()
     errors = {"image, mean": difference.mean().item(), "image, max": difference.max().item()}
     if len(workload.means) <= _GRADIENTS_UP_TO:
-        found, true = gradients(draw, workload), gradients(BASELINE, precise)
+        found, true = gradients(render_fn, workload), gradients(BASELINE, precise)
         errors |= {f"gradient of {name}": _relative(found[name], true[name]) for name in true}
     return errors
 
@@ -182,7 +182,7 @@ def _relative(found: Tensor, true: Tensor) -> float:
 
 
 def _training(scene: Scene, repeats: int, device: torch.device) -> dict[str, Any]:
-    """Measure training steps, drawn by each engine."""
+    """Measure training steps, rendered by each engine."""
     clock, engines = processor_clock(device), engines_on(device)
     parts = {e: step_parts(scene, e, repeats=repeats, device=device, clock=clock) for e in engines}
     steps = {e: analytic_step(scene, e, repeats=repeats, device=device, clock=clock) for e in engines}

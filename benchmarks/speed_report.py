@@ -28,7 +28,7 @@ def regressions(
         old: the content of an older ``speed.json``.
         time_factor: a ratio of times may grow by this factor.
         error_factor: an error may grow by this factor; the largest of an image may always be 1/255, because rounding
-            decides whether a pair on the edge is drawn.
+            decides whether a pair on the edge is rendered.
 
     Returns:
         One line per number that grew by more.
@@ -66,7 +66,7 @@ def speed_tables(report: Mapping[str, Any]) -> str:
     """Return a report as Markdown: per workload and engine the times, stages and errors; then the training step."""
     workloads, training, machine = report["workloads"], report["training"], report["machine"]
     tables = {
-        "Times": [_times(name, w, x) for name, w in workloads.items() for x in _drawn(w)],
+        "Times": [_times(name, w, x) for name, w in workloads.items() for x in _renderers(w)],
         "Scores and threads": [_ratios(name, w, e) for name, w in workloads.items() for e in w["stages"]],
         "Stages, ms": [_stages(name, w, e) for name, w in workloads.items() for e in w["stages"]],
         "Errors against float64": _errors(workloads),
@@ -91,8 +91,8 @@ _NOTES = (
 )
 
 
-def _drawn(w: Mapping[str, Any]) -> list[str]:
-    """Return what drew a workload: the engines, gsplat if it was there, and the baseline."""
+def _renderers(w: Mapping[str, Any]) -> list[str]:
+    """Return what rendered a workload: the engines, gsplat if it was there, and the baseline."""
     return [name.removesuffix(f": {PASSES[1]}") for name in w["seconds"] if name.endswith(PASSES[1])]
 
 
@@ -100,13 +100,13 @@ def _ms(seconds: Mapping[str, Any], name: str) -> float:
     return 1e3 * float(statistics.median(seconds[name]))
 
 
-def _times(name: str, w: Mapping[str, Any], drawer: str) -> dict[str, object]:
-    """Return the row of what drew a workload."""
-    row: dict[str, object] = {"workload": f"{name} ({w['gaussians']}, {w['width']}x{w['height']})", "drawn by": drawer}
+def _times(name: str, w: Mapping[str, Any], by: str) -> dict[str, object]:
+    """Return the row of what rendered a workload."""
+    row: dict[str, object] = {"workload": f"{name} ({w['gaussians']}, {w['width']}x{w['height']})", "rendered by": by}
     for x in PASSES:
-        ms, peak = _ms(w["seconds"], f"{drawer}: {x}"), w["memory"].get(drawer)
+        ms, peak = _ms(w["seconds"], f"{by}: {x}"), w["memory"].get(by)
         row[f"{x}, ms"] = ms
-        row[f"{x} / baseline"] = w["ratios"].get(f"{drawer}: {x} / baseline", 1)
+        row[f"{x} / baseline"] = w["ratios"].get(f"{by}: {x} / baseline", 1)
         row[f"{x}, M pairs/s"] = w["pairs"] / ms / 1e3
         row[f"{x}, peak MiB"] = None if peak is None else peak[x] / _MIB
     return row

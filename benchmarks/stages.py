@@ -1,4 +1,4 @@
-"""Where the time of a rendering goes: stage by stage, of whichever engine draws."""
+"""Where the time of a rendering goes: stage by stage, of whichever engine renders."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ FEW = 450
 """So many it finds where it must find the cameras as well."""
 COUNTS = (5_000, 8_000, 30_000)
 """Points of a dense start, which usually has 15,000."""
-LEAST = 20
+MIN_MATCHES = 20
 """So many points place a photograph."""
 
 
@@ -151,7 +151,7 @@ def with_own_cameras(data: Path, out: Path, name: str) -> None:
     """Write a folder in which the training photographs tell the cameras, as for ``ca-reg run``, and the others test.
 
     The others are placed in the reconstruction of the training photographs, which stays as it is: by the points that
-    they share with it, if they are `LEAST` or more.
+    they share with it, if they are `MIN_MATCHES` or more.
     """
     import pycolmap
 
@@ -223,10 +223,10 @@ def _placed(model: Any, images: Path) -> list[tuple[str, int, Any]]:
             with Image.open(images / name) as picture:
                 size = picture.size
             camera = next(camera for camera in model.cameras.values() if (camera.width, camera.height) == size)
-            if len(pairs) >= LEAST:
+            if len(pairs) >= MIN_MATCHES:
                 seen = [np.array(part) for part in zip(*pairs, strict=True)]
                 place = pycolmap.estimate_and_refine_absolute_pose(*seen, camera)
-                if place is not None and place["num_inliers"] >= LEAST:
+                if place is not None and place["num_inliers"] >= MIN_MATCHES:
                     found.append((name, camera.camera_id, place["cam_from_world"]))
         database.close()
     return found

@@ -37,7 +37,7 @@ def step_parts(
 
     Args:
         scene: what is trained.
-        engine: what draws.
+        engine: what renders.
         repeats: number of timed steps of each kind.
         device: where to train.
         clock: seconds.
@@ -105,7 +105,7 @@ def scores(workload: Workload, engine: str) -> dict[str, Callable[[], object]]:
     Every mask leaves out half of the Gaussians; drawing the masks and the variance are part of the score.
 
     Returns:
-        Calls by name, each drawn by the engine.
+        Calls by name, each rendered by the engine.
     """
     w = workload
     gaussians = Gaussians(
@@ -122,11 +122,11 @@ def scores(workload: Workload, engine: str) -> dict[str, Callable[[], object]]:
 
     def by_engine(call: Callable[[], object]) -> Callable[[], object]:
         @torch.no_grad()
-        def drawn() -> object:
+        def rendered() -> object:
             with using_engine(engine):
                 return call()
 
-        return drawn
+        return rendered
 
     return {
         "render": by_engine(lambda: model.render(opacities, view)),

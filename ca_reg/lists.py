@@ -118,12 +118,12 @@ class ListMoments:
             >>> ListMoments(lists_fn).shares(torch.tensor([0.5, 0.5]), None, Multiplier.dropout(0.5), None, ones)
             tensor([0.0625, 0.0000], dtype=torch.float64)
         """
-        lists, behind = self._lists(opacity, view, background)
+        lists, background = self._lists(opacity, view, background)
         if weights.shape != (lists.height, lists.width):
             raise ValueError(
                 f"weights must have the shape of the image, {(lists.height, lists.width)}, got {tuple(weights.shape)}."
             )
-        return _Walk.over(lists, behind, multiplier).shares(weights)
+        return _Walk.over(lists, background, multiplier).shares(weights)
 
     @torch.no_grad()
     def color_variance(self, opacity: Tensor, view: Any) -> Tensor:
@@ -131,7 +131,7 @@ class ListMoments:
         walk = _Walk.over(*self._lists(opacity, view, None), Multiplier(1.0, 0.0))
         weights, pixels = walk.blend_weights()
         colors = walk.values[:, :3].index_select(0, walk.gaussians)
-        nothing = torch.zeros_like(walk.behind[:, :3])
+        nothing = torch.zeros_like(walk.background[:, :3])
         total = nothing[:, 0].index_add(0, pixels, weights).clamp_min(torch.finfo(weights.dtype).tiny)[:, None]
         mean = nothing.index_add(0, pixels, weights[:, None] * colors) / total
         spread = weights[:, None] * (colors - mean.index_select(0, pixels)).square()
@@ -180,9 +180,9 @@ class ListMoments:
                     f"{name} of the lists must have the shape of alphas, {tuple(lists.alphas.shape)}, got "
                     f"{tuple(indices.shape)}."
                 )
-        behind = _background_of(lists, background)
-        _check_values(lists, behind)
-        return lists, behind
+        background = _background_of(lists, background)
+        _check_values(lists, background)
+        return lists, background
 
 
 _CHUNK = 1 << 20
@@ -200,7 +200,7 @@ class _Walk(NamedTuple):
         gaussians: of the entries, shape (P,).
         alphas: of the entries, shape (P,).
         values: red, green, blue and 1 of all Gaussians, shape (N, 4); the 1 gives the alpha.
-        behind: the colors behind the sorted pixels, and 0, shape (H * W, 4).
+        background: the colors behind the sorted pixels, and 0, shape (H * W, 4).
         factors: mean and variance of every Gaussian's factor, () or (N,).
         ranks: the place of every pixel among the sorted ones, shape (H * W,).
         shape: of the image, (H, W).
@@ -210,15 +210,15 @@ class _Walk(NamedTuple):
     gaussians: Tensor
     alphas: Tensor
     values: Tensor
-    behind: Tensor
+    background: Tensor
     factors: tuple[Tensor, Tensor]
     ranks: Tensor
     shape: tuple[int, int]
 
     @classmethod
-    def over(cls, lists: PixelLists, behind: Tensor, multiplier: Multiplier) -> _Walk:
+    def over(cls, lists: PixelLists, background: Tensor, multiplier: Multiplier) -> _Walk:
         """Sort the entries of the lists."""
-        size, entries, device = len(behind), len(lists.alphas), behind.device
+        size, entries, device = len(background), len(lists.alphas), background.device
         dtype = torch.int32 if max(size, entries) < 2**31 else torch.int64
         mean, variance = (_per_gaussian(getattr(multiplier, name), name, lists) for name in ("mean", "variance"))
         pixels, order = torch.sort(lists.pixels.to(dtype), stable=True)
@@ -237,7 +237,7 @@ class _Walk(NamedTuple):
             lists.gaussians.index_select(0, order),
             lists.alphas.index_select(0, order),
             torch.cat([lists.colors, torch.ones_like(lists.colors[:, :1])], dim=1),
-            torch.nn.functional.pad(behind, (0, 1)).index_select(0, by_length),
+            torch.nn.functional.pad(background, (0, 1)).index_select(0, by_length),
             (mean, variance),
             ranks,
             (lists.height, lists.width),
@@ -248,11 +248,11 @@ class _Walk(NamedTuple):
         # Nothing is kept for the backward pass but the states between chunks: it computes again what is between them.
         again = partial(checkpoint, _advance, use_reentrant=False, preserve_rng_state=False)
         advance = again if terms is None and torch.is_grad_enabled() else partial(_advance, terms=terms)
-        mean = variance = self.behind[:0]
+        mean = variance = self.background[:0]
         chunks = self._chunks()
         ends = [0, *(counts[-1] for counts, _, _ in chunks), len(self.ranks)]
-        *behind, rest = torch.split(self.behind, [b - a for a, b in pairwise(ends)])
-        for chunk, begins in zip(chunks, behind, strict=True):
+        *backgrounds, rest = torch.split(self.background, [b - a for a, b in pairwise(ends)])
+        for chunk, begins in zip(chunks, backgrounds, strict=True):
             mean, variance = advance(*chunk, mean, variance, begins, self.values, *self.factors)
         moments = torch.cat([mean, rest]), torch.cat([variance, torch.zeros_like(rest)])
         mean, variance = (x.index_select(0, self.ranks).T.reshape(4, *self.shape) for x in moments)
@@ -262,7 +262,7 @@ class _Walk(NamedTuple):
         """Return what each Gaussian adds to the variance, mean over RGB, weighted by pixels (H, W); (N,), float64."""
         terms: list[Tensor] = []
         self.moments(terms)
-        front = torch.empty_like(self.behind[:, 0], dtype=torch.float64)
+        front = torch.empty_like(self.background[:, 0], dtype=torch.float64)
         front.scatter_(0, self.ranks.long(), weights.to(front).flatten())
         out = front.new_zeros(len(self.values))
         for (counts, gaussians, alphas), term in zip(reversed(self._chunks()), reversed(terms), strict=True):
@@ -279,7 +279,7 @@ class _Walk(NamedTuple):
 
     def blend_weights(self) -> tuple[Tensor, Tensor]:
         """Return alpha times transmittance of every entry, and the place of its pixel among the sorted ones."""
-        light, parts = torch.ones_like(self.behind[:, 0]), list[Tensor]()
+        light, parts = torch.ones_like(self.background[:, 0]), list[Tensor]()
         for alphas in reversed(torch.split(self.alphas, self.counts)):  # from the front
             parts.append(alphas * (light := light[: len(alphas)]))
             light = light * (1.0 - alphas)
@@ -314,16 +314,16 @@ def _spread(alphas: Tensor, gaussians: Tensor, *factors: Tensor) -> tuple[Tensor
 
 
 def _advance(
-    counts: list[int], gaussians: Tensor, alphas: Tensor, mean: Tensor, variance: Tensor, behind: Tensor,
+    counts: list[int], gaussians: Tensor, alphas: Tensor, mean: Tensor, variance: Tensor, background: Tensor,
     values: Tensor, *factors: Tensor, terms: list[Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Carry mean and variance of what is behind, (B, 4), over a chunk of entries, see `ca_reg.functional.moments`.
 
-    ``behind`` is that of the pixels whose lists begin here. ``terms`` collects the summands of the variance, mean over
+    ``background`` is that of the pixels whose lists begin here. ``terms`` collects the summands of the variance, mean
     RGB, of all entries.
     """
     columns = (*(x[:, None] for x in _spread(alphas, gaussians, *factors)), values.index_select(0, gaussians))
-    begins = torch.split(behind, [b - a for a, b in pairwise([len(mean), *counts])])
+    begins = torch.split(background, [b - a for a, b in pairwise([len(mean), *counts])])
     found = []
     for expected, spread, shrink, value, new in zip(*(torch.split(x, counts) for x in columns), begins, strict=True):
         if len(new):
@@ -366,22 +366,22 @@ def _per_gaussian(moment: float | Tensor, name: str, lists: PixelLists) -> Tenso
     return moment.to(lists.alphas).flatten()
 
 
-def _check_values(lists: PixelLists, behind: Tensor) -> None:
+def _check_values(lists: PixelLists, background: Tensor) -> None:
     """Raise unless indices and alphas are in their ranges and colors finite; one wait for a GPU."""
-    found = [lists.colors.sum(), behind.sum()]
+    found = [lists.colors.sum(), background.sum()]
     if len(lists.alphas):
         found += [x for given in (lists.gaussians, lists.pixels, lists.alphas) for x in torch.aminmax(given)]
-    colors, background, *ends = torch.stack([x.detach().double() for x in found]).tolist()
+    color_sum, background_sum, *ends = torch.stack([x.detach().double() for x in found]).tolist()
     if ends:
-        indices, (least, most) = (("gaussians", len(lists.colors)), ("pixels", len(behind))), ends[4:]
+        indices, (least, most) = (("gaussians", len(lists.colors)), ("pixels", len(background))), ends[4:]
         for (name, end), low, high in zip(indices, ends[:4:2], ends[1:4:2], strict=True):
             if low < 0 or high >= end:
                 raise ValueError(f"{name} of the lists must be in [0, {end}), got values from {low:.0f} to {high:.0f}.")
         if not (least >= 0 and most <= 1):
             check_alphas(lists.alphas)
-    if not math.isfinite(colors):  # those of Gaussians that are not listed may be anything
+    if not math.isfinite(color_sum):  # those of Gaussians that are not listed may be anything
         listed = torch.zeros_like(lists.colors[:, 0], dtype=torch.bool)
         listed[lists.gaussians.long()] = True
         check_all_finite(lists.colors[listed], "colors")
-    if not math.isfinite(background):
-        check_all_finite(behind, "background")
+    if not math.isfinite(background_sum):
+        check_all_finite(background, "background")

@@ -353,7 +353,7 @@ def plot_dynamics(
     """Plot co-adaptation and PSNR against the step, each on its own axes.
 
     ``runs`` is one log or log directory, or several by label. Each run has one color, by default the next of
-    matplotlib's, else that of its label in ``colors``; its last group of views (test) is solid. Draws on two ``axes``,
+    matplotlib's, else that of its label in ``colors``; its last group of views (test) is solid. Plots on two ``axes``,
     by default in a new figure, and returns them: co-adaptation, PSNR.
 
     Raises:
@@ -375,9 +375,9 @@ def plot_dynamics(
             ca_axes.plot(column["step"], column[f"ca/{group}"], label=f"{label} {group}".strip(), **style)
             if f"psnr/{group}" in column:
                 psnr_axes.plot(column["step"], column[f"psnr/{group}"], **style)
-    for drawn, quantity in ((ca_axes, "co-adaptation score CA"), (psnr_axes, "PSNR in dB")):
-        drawn.set_xlabel("iteration")
-        drawn.set_ylabel(quantity)
+    for axis, quantity in ((ca_axes, "co-adaptation score CA"), (psnr_axes, "PSNR in dB")):
+        axis.set_xlabel("iteration")
+        axis.set_ylabel(quantity)
     ca_axes.set_ylim(bottom=0.0)
     psnr_axes.legend(handles=[*ca_axes.lines], loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     return ca_axes, psnr_axes

@@ -190,8 +190,8 @@ class CAResult(_Score):
         # The root, because a few pixels hold most of the variance.
         heat = self.variance.sqrt().masked_fill(~self.visible, math.nan).cpu().numpy()
         ax.set_facecolor("0.6")
-        picture = ax.imshow(heat, cmap="inferno", vmin=0.0)
-        ax.figure.colorbar(picture, ax=ax, label="std over masks")
+        image = ax.imshow(heat, cmap="inferno", vmin=0.0)
+        ax.figure.colorbar(image, ax=ax, label="std over masks")
         error = "exact" if self.samples is None else f"± {self.std_error:.1g}"
         ax.set_title(f"CA {self.value:.3g} {error}" if self.reason is Reason.OK else self.reason.message)
         ax.set_xticks([])

@@ -304,11 +304,11 @@ class CallSite(NamedTuple):
     @classmethod
     def find(cls) -> CallSite:
         """Return the nearest caller named render..., else the nearest outside of this package and torch."""
-        found, foreign = None, 0
+        found, outside = None, 0
         frame: FrameType | None = sys._getframe(1)
-        while frame is not None and foreign < _OUTWARD:
-            if _is_foreign(frame.f_globals.get("__name__", "")):
-                foreign += 1
+        while frame is not None and outside < _OUTWARD:
+            if _is_outside(frame.f_globals.get("__name__", "")):
+                outside += 1
                 found = found or frame
                 if frame.f_code.co_name.startswith("render"):
                     found = frame
@@ -360,5 +360,5 @@ def second_regularizers(chain: Chain) -> dict[str, str]:
 
 
 @functools.lru_cache(maxsize=1024)
-def _is_foreign(module: str) -> bool:
+def _is_outside(module: str) -> bool:
     return module.rpartition(".")[0] != __package__ and module.partition(".")[0] != "torch"

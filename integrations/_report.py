@@ -104,11 +104,11 @@ class Hook(abc.ABC):
 
     @abc.abstractmethod
     def install(self) -> Self:
-        """Install the hook, call `_watch`, and return the hook."""
+        """Install the hook, call `_count_steps`, and return the hook."""
 
     @abc.abstractmethod
     def uninstall(self) -> None:
-        """Restore the original state, and call `_unwatch`."""
+        """Restore the original state, and call `_stop_counting`."""
 
     @abc.abstractmethod
     def _explain(self) -> str:
@@ -145,12 +145,12 @@ class Hook(abc.ABC):
         self.tally.lost += 1
         self._check(self.tally.lost, "training steps had no render that could be regularized")
 
-    def _watch(self) -> None:
-        """Start watching the steps of all optimizers."""
+    def _count_steps(self) -> None:
+        """Start counting the steps of all optimizers."""
         self._handle = register_optimizer_step_post_hook(self._stepped)
 
-    def _unwatch(self) -> None:
-        """Stop watching; no effect if not watching."""
+    def _stop_counting(self) -> None:
+        """Stop counting; no effect if not counting."""
         if self._handle is not None:
             self._handle.remove()
             self._handle = None

@@ -278,24 +278,24 @@ def reports_of_children() -> list[dict[str, Any]]:
     return [json.loads(path.read_text(encoding="utf-8")) for path in paths]
 
 
-class Watch:
+class ScriptAudit:
     """Notices files that a script writes and processes that it starts, within a ``with`` block."""
 
-    _current: Watch | None = None
+    _current: ScriptAudit | None = None
     _hooked = False
 
     def __init__(self) -> None:
         self.saved: str | None = None  # path of the model that was written last, as far as Python's own files go
         self.missed: list[str] = []  # commands of Python processes that do not see the environment of `in_children`
 
-    def __enter__(self) -> Watch:
-        if not Watch._hooked:  # such a hook cannot be removed
+    def __enter__(self) -> ScriptAudit:
+        if not ScriptAudit._hooked:  # such a hook cannot be removed
             sys.addaudithook(_audit)
-        Watch._hooked, Watch._current = True, self
+        ScriptAudit._hooked, ScriptAudit._current = True, self
         return self
 
     def __exit__(self, *error: object) -> None:
-        Watch._current = None
+        ScriptAudit._current = None
 
     def notice(self, event: str, arguments: tuple[Any, ...]) -> None:
         """Process an audit event of Python."""
@@ -320,8 +320,8 @@ class Watch:
 
 
 def _audit(event: str, arguments: tuple[Any, ...]) -> None:
-    if Watch._current is not None and event in ("open", "os.system", "subprocess.Popen"):
-        Watch._current.notice(event, arguments)
+    if ScriptAudit._current is not None and event in ("open", "os.system", "subprocess.Popen"):
+        ScriptAudit._current.notice(event, arguments)
 
 
 def explain_download(error: BaseException, root: Path, saved: str | None) -> str | None:
@@ -361,12 +361,12 @@ def old_aliases() -> Iterator[None]:
     def to_matplotlib(cm: ModuleType) -> None:
         give(cm, {"get_cmap": _get_cmap})
 
-    watch = AfterImport({"numpy": to_numpy, "matplotlib.cm": to_matplotlib})
-    watch.start()
+    imports = AfterImport({"numpy": to_numpy, "matplotlib.cm": to_matplotlib})
+    imports.start()
     try:
         yield
     finally:
-        watch.stop()
+        imports.stop()
         for module, name in added:
             delattr(module, name)
 

@@ -55,7 +55,7 @@ def regularized(
     Dropped Gaussians leave no trace in density control: their ``info["radii"]`` are 0, in the shapes of gsplat 1.4
     ([C, N]) and later ([C, N, 2]). In packed mode gsplat 1.5 and newer does not list them.
 
-    Convention: activated opacities, [..., N]; several batches are drawn as one set of Gaussians.
+    Convention: activated opacities, [..., N]; several batches are rendered as one set of Gaussians.
 
     Args:
         rasterization: ``gsplat.rasterization`` or ``gsplat.rasterization_2dgs``, or a function with the same arguments.
@@ -233,7 +233,7 @@ class Installation(Hook):
             self.functions[name] = made[id(function)]
             setattr(importlib.import_module(holder), name, made[id(function)])
         self._replaced, self.rasterization = found, self.functions["rasterization"]
-        self._watch()
+        self._count_steps()
         return self
 
     def generator(self, device: torch.device) -> torch.Generator | None:
@@ -249,7 +249,7 @@ class Installation(Hook):
 
     def uninstall(self) -> None:
         """Restore the original functions; a second call does nothing."""
-        self._unwatch()
+        self._stop_counting()
         while self._replaced:
             (holder, name), original = self._replaced.popitem()
             setattr(importlib.import_module(holder), name, original)

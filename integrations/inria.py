@@ -160,7 +160,7 @@ class RasterizerHook(Hook):
         )
         try:
             self._patched.start()
-            self._watch()
+            self._count_steps()
         except BaseException:
             self.uninstall()
             raise
@@ -175,7 +175,7 @@ class RasterizerHook(Hook):
             raise RuntimeError("this hook is not installed.")
         self._patched.check_removable()
         self._hooked = self._patched.names
-        self._unwatch()
+        self._stop_counting()
         self._patched.stop()
         self._patched = None
 

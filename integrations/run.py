@@ -33,7 +33,7 @@ from ca_reg.schedules import LinearRamp, Schedule, StartStop
 from ._calls import MODULES
 from ._report import Hook
 from ._scripts import (
-    Watch,
+    ScriptAudit,
     explain_download,
     find_script,
     folder_of_reports,
@@ -59,17 +59,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Exceptions of the script, SystemExit included, pass through.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    options, watch = _parse(arguments), Watch()
+    options, audit = _parse(arguments), ScriptAudit()
     try:
-        _launch(options, arguments, watch)
+        _launch(options, arguments, audit)
     except SystemExit as ended:
         if ended.code or options.guard is None:
             raise
     if options.guard is not None:
-        _guard(options, watch.saved)
+        _guard(options, audit.saved)
 
 
-def _launch(options: argparse.Namespace, arguments: Sequence[str], watch: Watch) -> None:
+def _launch(options: argparse.Namespace, arguments: Sequence[str], audit: ScriptAudit) -> None:
     """Run the script, hooked, and report how it ended."""
     hook: Hook | None = options.hook
     set_command_line(options.script, options.arguments)
@@ -80,9 +80,9 @@ def _launch(options: argparse.Namespace, arguments: Sequence[str], watch: Watch)
             name = ["-m", options.script] if options.module else [str(options.script.resolve())]
             own = arguments[: len(arguments) - len(options.arguments) - (2 if options.module else 1)]
             undo.enter_context(in_children(f"{__package__}.run:resume", own, name))
-        undo.enter_context(watch)
+        undo.enter_context(audit)
         undo.enter_context(old_aliases())
-        undo.enter_context(_reported(options, hook, watch))
+        undo.enter_context(_reported(options, hook, audit))
         if options.cpu:
             from reference_trainer.compat import stand_in
 
@@ -252,7 +252,7 @@ def _hook(options: argparse.Namespace) -> Hook | None:
 
 
 @contextmanager
-def _reported(options: argparse.Namespace, hook: Hook | None, watch: Watch) -> Iterator[None]:
+def _reported(options: argparse.Namespace, hook: Hook | None, audit: ScriptAudit) -> Iterator[None]:
     """Report what was done, however the script ends; exit with 1 if that is not what was asked for."""
     ended, problem = "finished", None
     try:
@@ -265,7 +265,7 @@ def _reported(options: argparse.Namespace, hook: Hook | None, watch: Watch) -> I
             raise
     except BaseException as error:
         ended = f"{type(error).__name__}: {error}".rstrip(": ")
-        problem = _explain_failure(error, options, watch)
+        problem = _explain_failure(error, options, audit)
         raise
     finally:
         started = reports_of_children()
@@ -281,7 +281,7 @@ def _reported(options: argparse.Namespace, hook: Hook | None, watch: Watch) -> I
         for child in started:
             done = "; ".join(child.get("done", ["nothing"]))
             lines.append(f"{child['script']}, a process that it started: {done}")
-        lines += [f"WARNING: a process that it started was not hooked: {command}" for command in watch.missed]
+        lines += [f"WARNING: a process that it started was not hooked: {command}" for command in audit.missed]
         for line in [*lines, *([f"ERROR: {problem}"] if problem else [])]:
             print(f"[ca_reg] {line}", file=sys.stderr)
         if options.report is not None:
@@ -299,7 +299,7 @@ def _problem(hook: Hook | None) -> str | None:
     return own or next((f"{child['script']}: {child['problem']}" for child in children if child["problem"]), None)
 
 
-def _explain_failure(error: BaseException, options: argparse.Namespace, watch: Watch) -> str | None:
+def _explain_failure(error: BaseException, options: argparse.Namespace, audit: ScriptAudit) -> str | None:
     """Say what to do about an exception of the script, where the launcher knows."""
     if isinstance(error, ModuleNotFoundError) and options.cpu:
         name = str(error.name)
@@ -309,7 +309,7 @@ def _explain_failure(error: BaseException, options: argparse.Namespace, watch: W
             f"There is no module {name}: install it, {named}or put a file in its place, beside the script, with what "
             "that calls of it"
         )
-    return explain_download(error, options.sources.root.resolve(), watch.saved)
+    return explain_download(error, options.sources.root.resolve(), audit.saved)
 
 
 if __name__ == "__main__":

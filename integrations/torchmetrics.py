@@ -104,7 +104,7 @@ class CAScoreMetric(Metric):
             return summary_of(self.sums, self.score.settings)
 
     def plot(self, val: Tensor | Sequence[Tensor] | None = None, ax: Any = None) -> Any:
-        """Draw one value or a sequence of them, by default the present mean; return the figure and its axes."""
+        """Plot one value or a sequence of them, by default the present mean; return the figure and its axes."""
         return self._plot(val, ax)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> CAScoreMetric:

@@ -1,4 +1,4 @@
-"""A pure-torch 3D Gaussian Splatting trainer for CPU and CUDA that demonstrates `ca_reg` end to end."""
+"""A 3D Gaussian Splatting trainer in PyTorch, numba and Triton, for CPU and CUDA, that shows `ca_reg` end to end."""
 
 import ctypes
 import os

@@ -13,7 +13,7 @@ import tyro
 
 from benchmarks.paper.cells import Grid, listing, run_cells
 from benchmarks.paper.claims import chosen
-from benchmarks.paper.comparison import Kept
+from benchmarks.paper.comparison import RowStore
 from benchmarks.paper.figure import gains_figure, ranking_figure
 from benchmarks.paper.page import details, page
 from benchmarks.paper.scenes import chosen_scenes
@@ -80,11 +80,11 @@ class Paper:
         scenes = chosen_scenes(self.scenes, self.data, own)
         claims = chosen(self.claims, [*scenes] if own.path else None)
         grid = Grid(claims, scenes, self.recipe, self.iterations, self.seeds, self.out, rows)
-        kept = Kept(rows, self.recipe, self.iterations)
+        store = RowStore(rows, self.recipe, self.iterations)
         for path in self.pages:
-            write_text(path, page(path.read_text("utf-8"), kept))
+            write_text(path, page(path.read_text("utf-8"), store))
         if self.figure is not None:
-            ranking_figure(kept, self.claims, self.figure) if self.claims else gains_figure(kept, self.figure)
+            ranking_figure(store, self.claims, self.figure) if self.claims else gains_figure(store, self.figure)
         if self.pages or self.figure:
             return
         if self.list:
@@ -93,7 +93,7 @@ class Paper:
         self.rendering.begin(self.device, trains=True)
         failed = run_cells(grid, Running(Processes(self.jobs), device=self.device, lpips=self.lpips))
         for name, claim in claims.items():
-            print(f"\n{name}. {claim.says}\n\n{details(name, Kept(rows, self.recipe, self.iterations))}")
+            print(f"\n{name}. {claim.says}\n\n{details(name, RowStore(rows, self.recipe, self.iterations))}")
         for name, why in failed.items():
             print(f"FAILED {name}: {why.error}; the same command tries it again", file=sys.stderr)
         if failed:

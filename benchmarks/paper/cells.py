@@ -121,7 +121,7 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
     """
     rows = rows_of(grid)
     left = [
-        replace(cell, needs=cell.needs | EXTRAS & (_kept(cell, rows) or {}).keys())
+        replace(cell, needs=cell.needs | EXTRAS & (_row_of(cell, rows) or {}).keys())
         for cell in declared(grid)
         if not is_done(cell, rows)
     ]
@@ -180,7 +180,7 @@ def rows_of(grid: Grid) -> dict[str, Rows]:
 
 def is_done(cell: Cell, rows: Mapping[str, Rows]) -> bool:
     """Return whether everything that is needed from a training is kept."""
-    return (row := _kept(cell, rows)) is not None and cell.needs <= row.keys()
+    return (row := _row_of(cell, rows)) is not None and cell.needs <= row.keys()
 
 
 def estimate(cell: Cell, rows: Mapping[str, Rows]) -> float:
@@ -269,7 +269,7 @@ def depths(model: TrainedModel, view: View, truth: TrainedModel | None) -> dict[
     return depth_errors(depth(model)[0], known)._asdict()
 
 
-def _kept(cell: Cell, rows: Mapping[str, Rows]) -> Row | None:
+def _row_of(cell: Cell, rows: Mapping[str, Rows]) -> Row | None:
     """Return the row of a training, if there is one."""
     return rows[cell.scene].of(cell.setting).get(cell.seed)
 

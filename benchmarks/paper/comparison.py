@@ -16,7 +16,7 @@ from benchmarks.paper.scenes import PAPER_SIZE, SCENES
 __all__ = [
     "ERRORS",
     "Gain",
-    "Kept",
+    "RowStore",
     "Verdict",
     "differences",
     "interval",
@@ -81,7 +81,7 @@ def overall(verdicts: Iterable[Verdict], *, needs_all: bool = False) -> Verdict:
     return "holds" if holds > len(found) / 2 else "fails" if fails > len(found) / 2 else "undecided"
 
 
-class Kept:
+class RowStore:
     """The kept rows of all scenes in a folder, looked up for one recipe and number of iterations."""
 
     def __init__(self, folder: Path, recipe: str = "3dgs", iterations: int = 3_000) -> None:
@@ -93,24 +93,24 @@ class Kept:
         return self.scenes[scene].of(resolved(setting, self.recipe, self.iterations))
 
 
-def tested(claim: Claim, kept: Kept) -> list[str]:
+def tested(claim: Claim, store: RowStore) -> list[str]:
     """Return the kept scenes that a claim is tested on: those it names, and a user's own."""
-    return [scene for scene in kept.scenes if scene in claim.scenes or scene not in SCENES | PAPER_SIZE]
+    return [scene for scene in store.scenes if scene in claim.scenes or scene not in SCENES | PAPER_SIZE]
 
 
-def differences(check: Check, scene: str, kept: Kept) -> list[float]:
+def differences(check: Check, scene: str, store: RowStore) -> list[float]:
     """Return the finite differences that a check is about, one per seed that has both figures."""
-    a, b = kept.of(scene, check.a), kept.of(scene, check.b)
+    a, b = store.of(scene, check.a), store.of(scene, check.b)
     pairs = [(value(a[seed], check.of), value(b[seed], check.to or check.of)) for seed in sorted(a.keys() & b.keys())]
     found = [(x - y) / (y if check.relative else 1.0) for x, y in pairs]
     return [difference for difference in found if math.isfinite(difference)]
 
 
-def judged(claim: Claim, kept: Kept) -> dict[str, tuple[int, Verdict]]:
+def judged(claim: Claim, store: RowStore) -> dict[str, tuple[int, Verdict]]:
     """Return, for every scene with measurements for all checks of a claim, the number of seeds and the verdict."""
     found = {}
-    for scene in tested(claim, kept):
-        of = [(check, differences(check, scene, kept)) for check in claim.checks]
+    for scene in tested(claim, store):
+        of = [(check, differences(check, scene, store)) for check in claim.checks]
         if of and all(seeds for _, seeds in of):
             verdicts = [verdict(seeds, check.low, check.high) for check, seeds in of]
             found[scene] = min(len(seeds) for _, seeds in of), overall(verdicts, needs_all=True)
@@ -135,7 +135,7 @@ class Gain(NamedTuple):
         return f"{self.psnr:+.2f} ± {self.error:.2f} dB{less}"
 
 
-def ranked(name: str, kept: Kept) -> list[tuple[str, float, dict[str, Gain]]]:
+def ranked(name: str, store: RowStore) -> list[tuple[str, float, dict[str, Gain]]]:
     """Return the settings of a claim, each compared with the plain training of the same views and recipe, best first.
 
     They are compared on every scene with at least two kept seeds of most settings, and sorted by the mean over scenes
@@ -147,12 +147,12 @@ def ranked(name: str, kept: Kept) -> list[tuple[str, float, dict[str, Gain]]]:
     claim, found = CLAIMS[name], dict[str, dict[str, Gain]]()
     for setting in claim.settings:
         plain = {key: x for key, x in setting.items() if key in ("recipe", "views")}
-        for scene in tested(claim, kept) if setting != plain else ():
-            of = differences(Check("test psnr", setting, plain), scene, kept)
-            score = differences(Check("test ca_exact_half", setting, plain, relative=True), scene, kept)
+        for scene in tested(claim, store) if setting != plain else ():
+            of = differences(Check("test psnr", setting, plain), scene, store)
+            score = differences(Check("test ca_exact_half", setting, plain, relative=True), scene, store)
             if len(of) > 1:
                 gain = Gain(*interval(of), statistics.fmean(score or [math.nan]))
-                found.setdefault(name_of(setting, kept), {})[scene] = gain
+                found.setdefault(name_of(setting, store), {})[scene] = gain
     counts = Counter(scene for of in found.values() for scene in of)
     common = sorted(scene for scene, count in counts.items() if 2 * count >= len(found))
     shown = {named: {scene: of[scene] for scene in common if scene in of} for named, of in found.items()}
@@ -160,6 +160,6 @@ def ranked(name: str, kept: Kept) -> list[tuple[str, float, dict[str, Gain]]]:
     return sorted(rows, key=lambda row: (len(row[2]), row[1]), reverse=True)
 
 
-def name_of(setting: Mapping[str, object], kept: Kept) -> str:
+def name_of(setting: Mapping[str, object], store: RowStore) -> str:
     """Return the label of a setting among those of the same recipe."""
-    return label(setting, {"recipe": kept.recipe})
+    return label(setting, {"recipe": store.recipe})

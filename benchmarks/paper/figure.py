@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.paper.claims import GAINS, Check
-from benchmarks.paper.comparison import Kept, differences, interval, ranked
+from benchmarks.paper.comparison import RowStore, differences, interval, ranked
 from reference_trainer.evaluation.style import COLORS, WIDTH, new_figure, readable
 
 __all__ = ["gains_figure", "ranking_figure"]
@@ -17,27 +17,27 @@ _FIGURES = ("test psnr", "gain in PSNR (dB)", 1.0), ("test ca_exact_half", "chan
 _DASHES = ".-", ".--"
 
 
-def gains_figure(kept: Kept, path: Path) -> None:
-    """Draw what is kept of `GAINS`: differences in PSNR and in the exact score, with two standard errors, by scene.
+def gains_figure(store: RowStore, path: Path) -> None:
+    """Plot what is kept of `GAINS`: differences in PSNR and in the exact score, with two standard errors, by scene.
 
     A scene has one color; lines of one scene differ by their dashes. A line needs at least three points, a column of
     panels at least one line. A single seed has no error bar.
 
     Args:
-        kept: the rows.
+        store: the rows.
         path: the PNG or SVG to write.
 
     Raises:
-        ValueError: if there is no line to draw.
+        ValueError: if there is no line to plot.
         ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
     """
-    panels = {axis: [_lines(axis, of, unit, kept) for of, _, unit in _FIGURES] for axis in GAINS}
+    panels = {axis: [_lines(axis, of, unit, store) for of, _, unit in _FIGURES] for axis in GAINS}
     panels = {axis: of for axis, of in panels.items() if any(of)}
     if not panels:
         raise ValueError(
-            f"{kept.folder} has no setting at three strengths or numbers of views: there is no line to draw."
+            f"{store.folder} has no setting at three strengths or numbers of views: there is no line to plot."
         )
-    colors = _colors(kept)
+    colors = _colors(store)
     with new_figure(path) as figure:
         figure.set_size_inches(WIDTH, 5.6)
         grid = figure.subplots(len(_FIGURES), len(panels), sharex="col", sharey="row", squeeze=False)
@@ -61,11 +61,11 @@ def gains_figure(kept: Kept, path: Path) -> None:
             lowest.legend(loc="upper right", bbox_to_anchor=(1.0, 0.93), fontsize=9)
 
 
-def ranking_figure(kept: Kept, names: Sequence[str], path: Path) -> None:
-    """Draw the settings of claims, the best first: difference in PSNR with two standard errors, and in the exact score.
+def ranking_figure(store: RowStore, names: Sequence[str], path: Path) -> None:
+    """Plot the settings of claims, the best first: difference in PSNR with two standard errors, and in the exact score.
 
     Args:
-        kept: the rows.
+        store: the rows.
         names: of the claims, each with a row of two panels.
         path: the PNG or SVG to write.
 
@@ -73,10 +73,10 @@ def ranking_figure(kept: Kept, names: Sequence[str], path: Path) -> None:
         ValueError: if nothing is known of a claim.
         ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
     """
-    ranks = {name: ranked(name, kept) for name in names}
+    ranks = {name: ranked(name, store) for name in names}
     if unknown := [name for name, rank in ranks.items() if not rank]:
-        raise ValueError(f"{kept.folder} has no two seeds of the settings of claim {unknown[0]}: nothing to rank.")
-    colors, sizes = _colors(kept), [len(rank) for rank in ranks.values()]
+        raise ValueError(f"{store.folder} has no two seeds of the settings of claim {unknown[0]}: nothing to rank.")
+    colors, sizes = _colors(store), [len(rank) for rank in ranks.values()]
     with new_figure(path) as figure:
         figure.set_size_inches(WIDTH, 0.5 * len(sizes) + 0.27 * sum(sizes))
         grid = figure.subplots(len(sizes), 2, sharex="col", sharey="row", squeeze=False, height_ratios=sizes)
@@ -98,9 +98,9 @@ def ranking_figure(kept: Kept, names: Sequence[str], path: Path) -> None:
         _legend_below(figure, grid[:, 0])
 
 
-def _colors(kept: Kept) -> dict[str, str]:
+def _colors(store: RowStore) -> dict[str, str]:
     """Return the color of every scene, the same in all figures and that of no strategy."""
-    return {scene: COLORS[number % len(COLORS)] for number, scene in enumerate(kept.scenes)}
+    return {scene: COLORS[number % len(COLORS)] for number, scene in enumerate(store.scenes)}
 
 
 def _legend_below(figure: Any, panels: Iterable[Any]) -> None:
@@ -109,12 +109,12 @@ def _legend_below(figure: Any, panels: Iterable[Any]) -> None:
     figure.legend([*lines.values()], [*lines], loc="outside lower center", ncols=min(4, len(lines)))
 
 
-def _lines(axis: str, of: str, unit: float, kept: Kept) -> dict[tuple[str, str], dict[float, tuple[float, float]]]:
+def _lines(axis: str, of: str, unit: float, store: RowStore) -> dict[tuple[str, str], dict[float, tuple[float, float]]]:
     """Return the lines of a panel by scene and name: mean and two standard errors in ``unit``, by position."""
     lines = {}
     for name, pairs in GAINS[axis].items():
-        for scene in kept.scenes:
-            found = {x: differences(Check(of, *pair, relative=unit != 1), scene, kept) for x, pair in pairs.items()}
+        for scene in store.scenes:
+            found = {x: differences(Check(of, *pair, relative=unit != 1), scene, store) for x, pair in pairs.items()}
             ends = {x: interval(seeds) for x, seeds in found.items() if seeds}
             places = {
                 x: (mean / unit, error / unit if math.isfinite(error) else 0.0) for x, (mean, error) in ends.items()

@@ -11,7 +11,7 @@ from itertools import combinations
 from benchmarks.paper.claims import AT_PAPER_SIZE, CLAIMS, TIMED, Check
 from benchmarks.paper.comparison import (
     ERRORS,
-    Kept,
+    RowStore,
     differences,
     interval,
     judged,
@@ -42,14 +42,14 @@ _TITLES = {
 _MARKS = re.compile(r"(<!-- paper (\w+)(?: ([\w-]+))?(?: (\d+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def claims_table(kept: Kept) -> str:
+def claims_table(store: RowStore) -> str:
     """Return one row per claim with its verdict, overall and by scene."""
     rows: list[dict[str, object]] = []
     columns = ["", "claim", "the paper", "verdict", "scenes (seeds)"]
     for name, claim in CLAIMS.items():
         if not claim.checks or name in AT_PAPER_SIZE:
             continue
-        scenes = judged(claim, kept)
+        scenes = judged(claim, store)
         known = [end for seeds, end in scenes.values() if seeds > 1]
         verdicts = {end: [f"{scene} ({seeds})" for scene, (seeds, it) in scenes.items() if it == end]
                     for end in ("holds", "fails", "undecided")}  # fmt: skip
@@ -60,32 +60,34 @@ def claims_table(kept: Kept) -> str:
     return markdown_table(rows, columns)
 
 
-def details(name: str, kept: Kept) -> str:
+def details(name: str, store: RowStore) -> str:
     """Return the table of a claim's settings and its checks for every scene with more than half of the settings."""
     claim, parts = CLAIMS[name], []
-    for scene in tested(claim, kept):
+    for scene in tested(claim, store):
         found = {}
         for setting in claim.settings:
-            if of := [row for row in kept.of(scene, setting).values() if claim.needs <= row.keys()]:
-                found[name_of(setting, kept)] = of
+            if of := [row for row in store.of(scene, setting).values() if claim.needs <= row.keys()]:
+                found[name_of(setting, store)] = of
         if 2 * len(found) > len(claim.settings):
-            about = kept.scenes[scene].content.get("about", "")
+            about = store.scenes[scene].content.get("about", "")
             parts.append(f"**{scene}**: {about}\n\n{_table(found, claim.shows)}")
-            lines = [_line(check, apart, kept) for check in claim.checks if (apart := differences(check, scene, kept))]
+            lines = [
+                _line(check, apart, store) for check in claim.checks if (apart := differences(check, scene, store))
+            ]
             parts += ["".join(lines)] if lines else []
     return "\n".join(parts)
 
 
-def gains(name: str, kept: Kept) -> str:
+def gains(name: str, store: RowStore) -> str:
     """Return the settings of a claim as `ranked`, as a table; "" if nothing is known of them."""
     lines: list[dict[str, object]] = []
-    for named, mean, of in ranked(name, kept):
+    for named, mean, of in ranked(name, store):
         lines.append({"setting": f"`{named}`", "mean": f"{mean:+.2f} dB", **of})
     scenes = sorted({column for line in lines for column in line} - {"setting", "mean"})
     return markdown_table(lines, ["setting", "mean", *scenes]) if lines else ""
 
 
-def scenes_table(kept: Kept) -> str:
+def scenes_table(store: RowStore) -> str:
     """Return one row per scene: its trainings, their processor hours, and how far the PSNR of seeds differs.
 
     Standard deviations are of settings with three seeds or more, pooled: of the trainings of one setting, and of the
@@ -94,8 +96,8 @@ def scenes_table(kept: Kept) -> str:
     """
     columns = ["scene", "trainings", "hours", "one training", "difference of two", "seeds for ± 0.1 dB"]
     lines = []
-    for scene, rows in kept.scenes.items():
-        of = [row for row in rows.rows if row["setting"]["iterations"] == kept.iterations]
+    for scene, rows in store.scenes.items():
+        of = [row for row in rows.rows if row["setting"]["iterations"] == store.iterations]
         if not of:
             continue
         found: dict[str, dict[int, float]] = {}
@@ -112,22 +114,22 @@ def scenes_table(kept: Kept) -> str:
     return markdown_table(lines, columns)
 
 
-def page(text: str, kept: Kept) -> str:
+def page(text: str, store: RowStore) -> str:
     """Return the text of a page with everything between its marks regenerated.
 
     The marks are ``<!-- paper WHAT NAME ITERATIONS -->`` and ``<!-- end -->``. WHAT is ``claims`` for the verdicts,
     ``scenes`` for `scenes_table`, ``details`` or ``gains`` for the claim NAME, ``details`` without a name for all
     claims, or ``rows`` for all rows of ``NAME.json`` beside the folder, whose entry ``usual`` holds the parts of a
-    setting that labels omit. ITERATIONS are by default those of ``kept``.
+    setting that labels omit. ITERATIONS are by default those of ``store``.
     """
 
     def made(match: re.Match[str]) -> str:
         what, name = match[2], match[3]
-        of = Kept(kept.folder, kept.recipe, int(match[4])) if match[4] else kept
+        of = RowStore(store.folder, store.recipe, int(match[4])) if match[4] else store
         if what in ("claims", "scenes"):
             body = (claims_table if what == "claims" else scenes_table)(of)
         elif what == "rows":
-            body = _rows(Rows(kept.folder.parent / f"{name}.json"))
+            body = _rows(Rows(store.folder.parent / f"{name}.json"))
         elif name:
             body = (gains if what == "gains" else details)(name, of) or "Not yet measured.\n"
         else:
@@ -172,7 +174,7 @@ def _table(rows: Mapping[str, Sequence[Row]], figures: Sequence[str]) -> str:
     return markdown_table(lines, ["setting", "seeds", *order])
 
 
-def _line(check: Check, of: Sequence[float], kept: Kept) -> str:
+def _line(check: Check, of: Sequence[float], store: RowStore) -> str:
     """Return a check in words: what is compared, mean and two standard errors, what is claimed, and the verdict."""
     title, unit = _TITLES[check.of]
     unit, sign = (0.01, " %") if check.relative else (unit, "")
@@ -184,6 +186,6 @@ def _line(check: Check, of: Sequence[float], kept: Kept) -> str:
         if math.isfinite(end)
     ]
     than = _TITLES[check.to or check.of][0]
-    pair = f"{name_of(check.a, kept)} - {name_of(check.b, kept)}" if check.a != check.b else name_of(check.a, kept)
+    pair = f"{name_of(check.a, store)} - {name_of(check.b, store)}" if check.a != check.b else name_of(check.a, store)
     what = title if than == title else f"{title} - {than}"
     return f"- `{pair}`, {what}: {measured} (claimed: {' and '.join(ends)}), {verdict(of, check.low, check.high)}\n"

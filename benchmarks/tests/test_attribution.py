@@ -1,4 +1,6 @@
+import contextlib
 import dataclasses
+import io
 import json
 import math
 
@@ -38,8 +40,9 @@ def run(tmp_path_factory, options, short):
 
 @pytest.fixture(scope="module")
 def study(run):
-    said: list[str] = []
-    return study_attribution(run, say=said.append), run / "attribution", said
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        data = study_attribution(run)
+    return data, run / "attribution", printed.getvalue()
 
 
 def luminance(gaussians: Gaussians) -> torch.Tensor:
@@ -48,7 +51,7 @@ def luminance(gaussians: Gaussians) -> torch.Tensor:
 
 
 def test_the_shares_in_the_file_add_up_to_the_score_that_is_printed(run, study):
-    data, out, said = study
+    data, out, printed = study
     model, scene = load_run_model(run)
     exact = model.exact_ca_score(drop_rate=0.5)
     values = [exact(model.gaussians.opacities, view).value for view in scene.test]
@@ -61,7 +64,8 @@ def test_the_shares_in_the_file_add_up_to_the_score_that_is_printed(run, study):
     )
     shares = arrays["shares"]
     assert shares.sum() == pytest.approx(data["score"], rel=1e-5)  # the variance map is float32
-    rows = dict(line.strip("| ").split(" | ") for line in said[0].splitlines()[2:])
+    table = [line for line in printed.splitlines() if line.startswith("|")]
+    rows = dict(line.strip("| ").split(" | ") for line in table[2:])
     assert float(rows["score x1e-3, mean over test views"]) == pytest.approx(shares.sum() * 1e3, rel=1e-5)
     assert float(rows["sum of the shares x1e-3"]) == pytest.approx(shares.sum() * 1e3, rel=1e-6)
     effects = arrays["total_effects"]
@@ -112,7 +116,7 @@ def test_views_of_the_same_name_in_two_folders_keep_their_pictures(run, tmp_path
     model, scene = load_run_model(run)
     views = tuple(dataclasses.replace(v, name=n) for v, n in zip(scene.test, ("a/r.png", "b/r.png"), strict=False))
     monkeypatch.setattr(shares_module, "load_run_model", lambda *a: (model, dataclasses.replace(scene, test=views)))
-    study_attribution(run, tmp_path, say=lambda text: None)
+    study_attribution(run, tmp_path)
     assert sorted(path.name for path in (tmp_path / "views").iterdir()) == ["a_r.png", "b_r.png"]
 
 
@@ -192,7 +196,7 @@ def test_concentration_counts_from_the_largest():
 
 
 def test_other_views_and_mistakes(run, tmp_path):
-    data = study_attribution(run, tmp_path, split="train", drop_rate=0.25, say=lambda text: None)
+    data = study_attribution(run, tmp_path, split="train", drop_rate=0.25)
     assert sorted(data["views"]) == sorted(view.name for view in load_run_model(run)[1].train)
     assert data["drop_rate"] == 0.25
     with pytest.raises(ValueError, match="split must be 'train' or 'test', got 'val'"):
@@ -213,6 +217,6 @@ def test_a_run_whose_opacities_depend_on_the_camera(run, tmp_path, options, shor
     trainer.save(tmp_path / CHECKPOINT)
     config = {"scene": dataclasses.asdict(options), "config": dataclasses.asdict(trainer.config)}
     write_json(tmp_path / CONFIG, config)
-    study_attribution(tmp_path, say=lambda text: None)
+    study_attribution(tmp_path)
     stored = load_ply(tmp_path / "attribution" / "attribution.ply")
     torch.testing.assert_close(stored.gaussians.opacities, trainer.gaussians.opacities.detach())

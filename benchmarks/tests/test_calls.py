@@ -1,10 +1,10 @@
-"""What is timed is the same for everything that draws."""
+"""What is timed is the same for everything that renders."""
 
 import pytest
 import torch
 
 from benchmarks import calls
-from benchmarks.calls import BASELINE, draw_of, gradients, image, others_on
+from benchmarks.calls import BASELINE, gradients, image, others_on, render_with
 from benchmarks.workloads import WorkloadSpec
 from reference_trainer.render import render
 
@@ -12,13 +12,13 @@ TINY = WorkloadSpec(80, 40, 24, 0.06)
 
 
 @pytest.mark.parametrize("name", ["numba", "torch", "gsplat"])
-def test_everything_draws_the_same(name, monkeypatch):
+def test_everything_renders_the_same(name, monkeypatch):
     monkeypatch.setattr(calls, "load_gsplat_render", lambda device: render)  # gsplat's has the same arguments
     workload = TINY.make()
-    precise, draw = workload.to(dtype=torch.float64), others_on(torch.device("cpu"))[name]
+    precise, render_fn = workload.to(dtype=torch.float64), others_on(torch.device("cpu"))[name]
     # The largest errors are pairs at the cut of 1/255, of which there are none here.
-    assert (image(draw, workload) - image(BASELINE, precise)).abs().max() < 1e-5
-    found, true = gradients(draw, workload), gradients(BASELINE, precise)
+    assert (image(render_fn, workload) - image(BASELINE, precise)).abs().max() < 1e-5
+    found, true = gradients(render_fn, workload), gradients(BASELINE, precise)
     assert list(found) == list(true) == list(workload.parameters)
     for x in true:
         assert (found[x] - true[x]).norm() / true[x].norm() < 1e-3
@@ -35,7 +35,7 @@ def test_gsplat_renders_the_same_workload():
     pytest.importorskip("gsplat", exc_type=ImportError)
     workload = TINY.make().to("cuda")
     found = image(others_on(torch.device("cuda"))["gsplat"], workload)
-    torch.testing.assert_close(found, image(draw_of("torch"), workload), rtol=0, atol=1e-2)
+    torch.testing.assert_close(found, image(render_with("torch"), workload), rtol=0, atol=1e-2)
 
 
 def test_the_gradients_are_those_of_the_mean_squared_error():

@@ -99,12 +99,12 @@ def test_tables_have_the_means_and_who_is_ahead():
 
 
 def test_the_folder_of_a_run_may_have_an_equals_sign(monkeypatch):
-    drawn = {}
-    monkeypatch.setattr(error_map, "draw", lambda runs, file: drawn.update(runs))
+    plotted = {}
+    monkeypatch.setattr(error_map, "plot", lambda runs, file: plotted.update(runs))
     run = "runs/noise_0.8_scale=True/seed_0"  # as compare calls it
     monkeypatch.setattr(sys, "argv", ["error_map", f"fern-noise-0={run}", "--picture", "picture.webp"])
     error_map.main()
-    assert drawn == {"fern-noise-0": run}
+    assert plotted == {"fern-noise-0": run}
 
 
 def test_the_page_has_the_tables_of_its_rows():

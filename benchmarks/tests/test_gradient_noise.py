@@ -7,6 +7,7 @@ import math
 
 import pytest
 import torch
+from heard import hearing
 from oracles import brute_force, random_scene
 from PIL import Image
 
@@ -350,15 +351,15 @@ def test_a_study_measures_plain_dropout_at_the_training_views_of_a_run(trainer, 
 
 def test_a_study_writes_its_results(run, result, tmp_path, monkeypatch):
     monkeypatch.setattr(study_module, "gradient_noise", lambda *args, **keywords: result)
-    said = []
-    (record,) = run_study(gradient_noise_study([run], draws=4), tmp_path, say=said.append).values()
+    with hearing() as messages:
+        (record,) = run_study(gradient_noise_study([run], draws=4), tmp_path).values()
     assert GradientNoise.from_dict(record) == result
     summary, pooled = record["summary"]["squared"]["sh"], Moments.total(result.over_views("squared", "sh"))
     assert (summary["relative_noise"], summary["worth_control"]) == (pooled.relative_noise, pooled.worth("control"))
     assert summary["share_of_masks"] == result.steps["squared"]["sh"].share_of_masks
     assert record["summary"]["seconds"]["ratio"] == result.seconds()[1] / result.seconds()[0]
     text = (tmp_path / "gradient_noise.md").read_text(encoding="utf-8")
-    assert text == said[-2]
+    assert text == messages[-2]
     assert f"{result.steps['photometric']['opacity_logits'].share_of_masks:.1%} |" in text
     assert "agree bit by bit" in text
     with Image.open(tmp_path / "gradient_noise.png") as picture:

@@ -16,10 +16,6 @@ def peaks(spec, engine, device):
     return {"forward": MIB * spec.gaussians, "forward+backward": 2 * MIB * spec.gaussians}
 
 
-def quiet(text):
-    pass
-
-
 @pytest.fixture
 def canned(monkeypatch):
     """Workloads that take no time: 1 ms and 3 ms per Gaussian by torch, which alone draws."""
@@ -37,7 +33,7 @@ def canned(monkeypatch):
 
 def test_a_tiny_measurement_of_both_engines(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "peak_memory", peaks)
-    report = measure_growth(TINY, tmp_path, repeats=2, say=quiet)
+    report = measure_growth(TINY, tmp_path, repeats=2)
     assert json.loads((tmp_path / "growth.json").read_text()) == report
     assert (tmp_path / "growth.png").stat().st_size > 10_000
     for point in report["axes"]["layers"]["points"]:
@@ -60,19 +56,19 @@ def test_every_point_is_written_at_once_and_kept(canned, tmp_path, monkeypatch):
 
     monkeypatch.setattr(module, "_measure", fails_at_80)
     with pytest.raises(KeyboardInterrupt):
-        measure_growth(TINY, tmp_path, say=quiet)
+        measure_growth(TINY, tmp_path)
     monkeypatch.setattr(module, "_measure", measure)
-    first = measure_growth(TINY, tmp_path, say=quiet)
+    first = measure_growth(TINY, tmp_path)
     assert canned == [20, 40, 80]
-    again = measure_growth(TINY, tmp_path, say=quiet)
+    again = measure_growth(TINY, tmp_path)
     assert canned == [20, 40, 80]
     assert {**again, "date": 0} == {**first, "date": 0}
-    measure_growth(TINY, tmp_path, repeats=2, say=quiet)  # other settings
+    measure_growth(TINY, tmp_path, repeats=2)  # other settings
     assert canned == [20, 40, 80] * 2
 
 
 def test_exponents_reach_the_tables(canned, tmp_path):
-    measure_growth(TINY, tmp_path, say=quiet)
+    measure_growth(TINY, tmp_path)
     rows = [
         [cell.strip() for cell in line.strip("|").split("|")]
         for line in (tmp_path / "growth.md").read_text().splitlines()
@@ -85,15 +81,15 @@ def test_exponents_reach_the_tables(canned, tmp_path):
 
 def test_too_large_a_workload_is_left_out_with_its_reason(canned, tmp_path):
     # A round of 40 Gaussians takes 0.16 s, of 80 by extrapolation 0.32 s; 3 + 1 + 1 of them are needed.
-    report = measure_growth(TINY, tmp_path, time_limit=1.5, say=quiet)
+    report = measure_growth(TINY, tmp_path, time_limit=1.5)
     assert canned == [20, 40]
     *_, last = report["axes"]["layers"]["points"]
     assert last == {"x": 80, "skipped": "it would take about 1.6 s, extrapolated; the limit is 1.5 s"}
     assert "- 80 Gaussians: left out, it would take about 1.6 s" in (tmp_path / "growth.md").read_text()
     assert report["axes"]["layers"]["fits"] == {}
-    measure_growth(TINY, tmp_path, time_limit=1.7, say=quiet)
+    measure_growth(TINY, tmp_path, time_limit=1.7)
     assert canned == [20, 40, 80]
-    kept = measure_growth(TINY, tmp_path, time_limit=0.1, say=quiet)  # what is there already is not left out
+    kept = measure_growth(TINY, tmp_path, time_limit=0.1)  # what is there already is not left out
     assert "skipped" not in kept["axes"]["layers"]["points"][-1]
 
 

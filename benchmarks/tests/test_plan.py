@@ -64,7 +64,7 @@ def test_a_shortened_schedule_keeps_its_proportions():
 @pytest.mark.slow
 def test_the_study_trains_what_it_says(tmp_path, options, short):
     study = plan_study(options, config=short, iterations=4, seeds=2, alternatives=["no densification"])
-    records = [*run_study(study, tmp_path, executor=Here(), say=lambda text: None).values()]
+    records = [*run_study(study, tmp_path, executor=Here()).values()]
     assert [(record["variant"], record["config"]["seed"]) for record in records] == [
         (name, seed) for seed in (0, 1) for name in ("as asked", "SH bands", "no densification")
     ]
@@ -92,7 +92,7 @@ def test_a_training_that_fails_is_reported_and_the_others_go_on(options, short, 
 
     def trained():
         study = plan_study(options, config=short, iterations=4, seeds=2)
-        run_study(study, tmp_path, executor=Here(), say=lambda text: None)
+        run_study(study, tmp_path, executor=Here())
 
     monkeypatch.setattr(plan_module, "_train", train)
     with pytest.raises(RuntimeError, match=r"1 of 4 cases FAILED; .*\n  as asked, seed 1: MemoryError: no room"):

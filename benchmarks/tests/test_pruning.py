@@ -20,10 +20,6 @@ from reference_trainer.training.density import adaptive
 from reference_trainer.training.trainer import Trainer
 
 
-def silent(text: str) -> None:
-    """Say nothing."""
-
-
 def opaque(config: TrainConfig) -> TrainConfig:
     """Opaque enough to have a score after a few steps."""
     return dataclasses.replace(config, initial_opacity=0.9, opacity_reset_every=0)
@@ -128,7 +124,7 @@ def test_what_was_pruned_is_measured_before_and_after_further_steps(runs, tmp_pa
         pruning_module, "load_run", lambda folder, device: Trainer.load(folder / CHECKPOINT, scene, device)
     )
     study = pruning_study([folder], fractions=[0.25], refine=1)
-    whole, refined, *pruned = run_study(study, tmp_path, say=silent).values()
+    whole, refined, *pruned = run_study(study, tmp_path).values()
     assert (whole["steps"], refined["steps"]) == (0, 1)
     assert (whole["psnr"], whole["gaussians"]) == (evaluation.mean("test", "psnr"), evaluation.gaussians)
     assert whole["ca_protocol"] == evaluation.mean("test", "ca_half")
@@ -156,7 +152,7 @@ def test_the_report_is_of_mean_and_spread_over_runs():
         assert len(rows) == 1 + len(plan)  # with the header
         assert rows[-1] == ["random", "40%", "90", "20.00 ± 0.40", "n/a", "50 ± 0", protocol]
     figure = Figure()
-    pruning_module._draw(found, figure)
+    pruning_module._plot(found, figure)
     lines = figure.axes[0].get_legend_handles_labels()[0]
     assert (len(figure.axes), len(lines)) == (4, len(CRITERIA))
     x, y = lines[0].lines[0].get_data()

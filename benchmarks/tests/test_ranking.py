@@ -26,10 +26,6 @@ OPACITY = 0.95
 VIEWS = 96
 
 
-def silent(text: str) -> None:
-    """Say nothing."""
-
-
 def model_of_layers(grays: list[float], size: float) -> TrainedModel:
     """Gray Gaussians behind one another, over black."""
     n = len(grays)
@@ -192,7 +188,7 @@ def test_scores_are_those_of_the_evaluation(trained):
 
 
 def test_a_study_leaves_numbers_tables_and_a_figure(trained, tmp_path):
-    records = run_study(ranking_study(trained[0], views=1), tmp_path, say=silent)
+    records = run_study(ranking_study(trained[0], views=1), tmp_path)
     plain = records["/".join(trained[0][1].parts[-3:])]
     assert plain["strategy"] == "plain"
     assert plain["views"][0]["protocol"] == plain["views"][0]["protocol_half"]
@@ -252,5 +248,5 @@ def test_a_run_without_a_value_is_shown_as_such(tmp_path):
     assert "| 4 (1/2) |" in lines[0]
     assert lines[1].count("n/a") == len(VARIANTS) - 1
     figure = Figure()
-    ranking_module._draw(records, figure)
+    ranking_module._plot(records, figure)
     figure.savefig(tmp_path / "figure.png")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from heard import hearing
 
 from benchmarks import remedy
 from reference_trainer.scenes import load_scene
@@ -50,13 +51,13 @@ def test_what_is_trained_alike_differs_by_nothing_and_is_kept(tmp_path, monkeypa
     monkeypatch.setitem(remedy.SCENES, "synthetic", SceneOptions(downscale=8))
     monkeypatch.setattr(remedy, "synthetic_scene", lambda **given: synthetic_scene(20, 15, **given))
     arms = ["iterations=3; dropout=0.2", "iterations=3; dropout=0.2; noise=0.0", "iterations=3"]
-    study, said = remedy.remedy_study("choose", arms, scenes=["synthetic"], seeds=1), []
-    records = run_study(study, tmp_path, say=said.append)
+    study = remedy.remedy_study("choose", arms, scenes=["synthetic"], seeds=1)
+    records = run_study(study, tmp_path)
     quality = [record["psnr"] for record in records.values()]
     assert quality[0] == quality[1] != quality[2]
-    again: list[str] = []
-    assert run_study(study, tmp_path, say=again.append) == records
-    assert not any(line.startswith("[") for line in again)
+    with hearing() as messages:
+        assert run_study(study, tmp_path) == records
+    assert not any(line.startswith("[") for line in messages)
 
 
 def test_the_overview_has_means_of_pairs_and_says_where_a_scene_lacks():

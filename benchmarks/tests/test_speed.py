@@ -22,8 +22,7 @@ def measure(monkeypatch):
     peaks = {"forward": 3 << 20, "forward+backward": 5 << 20}
     monkeypatch.setattr(module, "peak_memory", lambda spec, engine, device: peaks)
     scene = synthetic_scene(width=20, height=15, points=60)
-    said = []
-    return lambda out, **how: measure_speed(TINY, out, scene=scene, repeats=2, say=said.append, **how)
+    return lambda out, **how: measure_speed(TINY, out, scene=scene, repeats=2, **how)
 
 
 @pytest.mark.slow

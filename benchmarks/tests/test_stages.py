@@ -5,7 +5,7 @@ import itertools
 import pytest
 import torch
 
-from benchmarks.calls import draw_of, gradients, image
+from benchmarks.calls import gradients, image, render_with
 from benchmarks.stages import STAGES, staged
 from benchmarks.workloads import WorkloadSpec, covered_pairs
 
@@ -15,9 +15,9 @@ def test_the_stages_do_what_a_rendering_and_its_gradient_do(engine):
     workload = WorkloadSpec(80, 40, 24, 0.06).make()
     ticks = itertools.count()
     found = staged(workload, engine, lambda: float(next(ticks)))
-    draw = draw_of(engine)
-    torch.testing.assert_close(found.image, image(draw, workload))
-    for name, true in gradients(draw, workload).items():
+    render_fn = render_with(engine)
+    torch.testing.assert_close(found.image, image(render_fn, workload))
+    for name, true in gradients(render_fn, workload).items():
         torch.testing.assert_close(found.gradients[name], true)
     # The clock is read twice around the binning, which is no part of the projection, and once after every stage.
     assert found.seconds == dict.fromkeys(STAGES, 1.0) | {"projection": 2.0}

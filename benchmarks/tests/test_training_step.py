@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks import training_step
-from benchmarks.calls import draw_of, image
+from benchmarks.calls import image, render_with
 from benchmarks.training_step import PARTS, analytic_step, scores, step_parts
 from benchmarks.workloads import WorkloadSpec
 from reference_trainer.scenes import synthetic_scene
@@ -17,7 +17,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture
 def steps(monkeypatch):
-    """What every step of a training was: its degree, whether it is analytic, and what drew it."""
+    """What every step of a training was: its degree, whether it is analytic, and what rendered it."""
     seen = []
     original, render = Trainer.train_step, training_step.render_gaussians
 
@@ -56,22 +56,22 @@ def test_analytic_and_sampled_steps_take_turns(scene, steps):
 
 
 @pytest.mark.parametrize("engine", ["numba", "torch"])
-def test_scores_are_those_of_the_workload_drawn_by_the_engine(engine, monkeypatch):
-    drawn = []
+def test_scores_are_those_of_the_workload_rendered_by_the_engine(engine, monkeypatch):
+    rendered = []
     splats = training_step.TrainedModel.splats
 
     def spy(self, opacities, view):
-        drawn.append(splats(self, opacities, view))
-        return drawn[-1]
+        rendered.append(splats(self, opacities, view))
+        return rendered[-1]
 
     monkeypatch.setattr(training_step.TrainedModel, "splats", spy)
     workload = WorkloadSpec(300, 40, 24, 0.06).make()
     calls = scores(workload, engine)
     found, _ = calls["render"]()
-    torch.testing.assert_close(found, image(draw_of(engine), workload), rtol=0, atol=1e-5)
+    torch.testing.assert_close(found, image(render_with(engine), workload), rtol=0, atol=1e-5)
     exact = calls["exact score"]()
     sampled = [calls["score, K = 5"]() for _ in range(2)]
-    assert [len(x.indices) for x in drawn] == [300] * 3  # one projection for each score, none is kept
-    assert {x.engine.name for x in drawn} == {engine}
+    assert [len(x.indices) for x in rendered] == [300] * 3  # one projection for each score, none is kept
+    assert {x.engine.name for x in rendered} == {engine}
     assert 0 < exact.value < 1
     assert sampled[0].value == sampled[1].value > 0

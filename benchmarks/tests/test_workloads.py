@@ -71,12 +71,12 @@ def test_a_workload_moves_as_a_whole():
     }
 
 
-def test_pairs_are_those_that_brute_force_draws():
+def test_pairs_are_those_that_brute_force_renders():
     # Some ellipses reach beyond the picture, some lie outside.
     workload = WorkloadSpec(40, 30, 20, 0.02).make().to(dtype=torch.float64)
-    drawn = [
+    rendered = [
         (brute_force(*(x[i : i + 1] for x in workload.parameters.values()), workload.camera)[1] > 0).sum().item()
         for i in range(40)
     ]
-    assert covered_pairs(workload) == sum(drawn)
-    assert min(drawn) == 0
+    assert covered_pairs(workload) == sum(rendered)
+    assert min(rendered) == 0

@@ -23,10 +23,10 @@ class SEGSNoise(Regularizer):
         n * ratio * max(mean |column|, 1),   n ~ N(0, 1),   ratio = first (last / first)^((t - start) / (stop - start))
 
     from step ``start`` to ``stop``. The six numbers are the first two rows of the rotation matrix (Zhou et al. 2019),
-    orthonormalized again by Gram-Schmidt. ``eval()`` changes nothing, as the source renders its unperturbed field.
+    orthonormalized again by Gram-Schmidt. ``eval()`` changes nothing, as the source renders its unperturbed model.
 
-    Unlike here, the source trains two fields and perturbs the second, every 500 steps, permanently, and only the
-    Gaussians under pixels that its first field has rendered differently over time; the trainer's density control
+    Unlike here, the source trains two models and perturbs the second, every 500 steps, permanently, and only the
+    Gaussians under pixels that its first model has rendered differently over time; the trainer's density control
     ``self_ensembling`` does that. The noise does not just multiply alphas, so there is no exact multiplier. The floor
     of 1 on the mean makes the noise of the centers depend on the world unit.
 

@@ -32,13 +32,13 @@ from reference_trainer.devices import check_device
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES, with_recipe
 
-__all__ = ["main"]
+__all__ = ["log_shown", "main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``ca-reg``; errors that a user can fix exit with one line and code 2, an interruption with 130."""
     arguments = (sys.argv[1:] if arguments is None else list(arguments)) or ["--help"]
-    with _log_shown():
+    with log_shown():
         _run(arguments)
 
 
@@ -80,7 +80,7 @@ class _Shown(logging.Handler):
 
 
 @contextmanager
-def _log_shown() -> Iterator[None]:
+def log_shown() -> Iterator[None]:
     """Show the messages of the trainer, and warnings of other packages, while a command runs."""
     root, trainer, shown = logging.getLogger(), logging.getLogger("reference_trainer"), _Shown()
     level = trainer.level

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from reference_trainer.cli import options
-from reference_trainer.cli.options import Device, Orbit, PlyScene, Rendering, RenderOptions, Trust, place_of
+from reference_trainer.cli.options import Device, Orbit, PlyScene, Rendering, RenderOptions, Trust, scene_or_orbit
 from reference_trainer.cli.training import PORT, Lpips
 from reference_trainer.runs.folder import check_run, folder_name, modules_named, report_file, runs_of
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
@@ -46,11 +46,11 @@ class Evaluate:
     rendering: Rendering = field(default_factory=RenderOptions)
 
     def check(self) -> None:
-        place = place_of(self.run, self.scene, self.orbit)
-        if isinstance(place, OrbitOptions) and self.lpips is not None:
+        where = scene_or_orbit(self.run, self.scene, self.orbit)
+        if isinstance(where, OrbitOptions) and self.lpips is not None:
             raise ValueError("without photographs there is no --lpips: give --scene.")
-        options.check_model(self.run, place)
-        options.check_out(self.out, self.run, place)
+        options.check_model(self.run, where)
+        options.check_out(self.out, self.run, where)
 
     def __call__(self) -> None:
         from reference_trainer.evaluation.lpips import load_lpips
@@ -59,14 +59,14 @@ class Evaluate:
         from reference_trainer.runs.ply import score_ply
         from reference_trainer.scenes.virtual_cameras import measured_views
 
-        place = place_of(self.run, self.scene, self.orbit)
+        where = scene_or_orbit(self.run, self.scene, self.orbit)
         self.rendering.begin(self.device)
         # Modules named on this command line are trusted; --trust is for those that a file names.
         trust = {*self.trust, *modules_named(self.regularizer or "")}
         shared: dict[str, Any] = {
             "samples": self.samples, "seed": self.seed, "perceptual": load_lpips(self.lpips, device=self.device)
         }  # fmt: skip
-        if place is None:
+        if where is None:
             model, scene = load_run_model(self.run, self.device, regularizer=self.regularizer, trust=trust)
             # A folder of its own, or the scores of another regularizer would take the place of the run's.
             name = "evaluation" if self.regularizer is None else f"evaluation_{folder_name(self.regularizer)}"
@@ -77,7 +77,7 @@ class Evaluate:
             log_what_hangs(model, scene, out)
         else:
             shared |= {"regularizer": self.regularizer, "device": self.device, "background": self.scene.background}
-            score_ply(self.run, place, self.out, trust=trust, **shared)
+            score_ply(self.run, where, self.out, trust=trust, **shared)
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ class View:
         if not 1 <= len(self.runs) <= 2 or len(set(self.runs)) < len(self.runs):
             raise ValueError(f"expected 1 model to show, or 2 that differ, got {[str(run) for run in self.runs]}.")
         for run in self.runs:
-            options.check_model(run, place_of(run, self.scene, self.orbit))
+            options.check_model(run, scene_or_orbit(run, self.scene, self.orbit))
 
     def __call__(self) -> None:
         from reference_trainer.runs.measure import load_run_model
@@ -217,7 +217,7 @@ class View:
         with Viewer(self.port) as viewer:
             self.rendering.begin(self.device, trains=True)  # so that no later picture waits for the compiler
             for run in self.runs:
-                where = place_of(run, self.scene, self.orbit)
+                where = scene_or_orbit(run, self.scene, self.orbit)
                 if where is None:
                     model, scene = load_run_model(run, **shared)
                     viewer.show(model, measured_views(scene), str(run))
@@ -293,18 +293,18 @@ class Clean:
 
     def check(self) -> None:
         options.check_ply(self.ply)
-        options.check_model(self.ply, place_of(self.ply, self.scene, self.orbit))
+        options.check_model(self.ply, scene_or_orbit(self.ply, self.scene, self.orbit))
 
     def __call__(self) -> None:
         from reference_trainer.runs.edit_ply import clean_ply
 
-        place = place_of(self.ply, self.scene, self.orbit)
-        assert place is not None
+        where = scene_or_orbit(self.ply, self.scene, self.orbit)
+        assert where is not None
         # Refining needs photographs. With an orbit nothing is trained, so the loops of a training are not compiled.
-        self.rendering.begin(self.device, trains=isinstance(place, SceneOptions))
+        self.rendering.begin(self.device, trains=isinstance(where, SceneOptions))
         clean_ply(
             self.ply,
-            place,
+            where,
             self.out or self.ply.with_name(f"{self.ply.stem}_clean.ply"),
             fraction=self.fraction,
             refine=self.refine,

@@ -19,13 +19,20 @@ from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 
 __all__ = [
     "Device", "Orbit", "PlyScene", "RenderOptions", "Rendering", "Trust", "check_model", "check_out", "check_ply",
-    "check_scenes", "place_of", "refuse_old_options",
+    "check_scenes", "refuse_old_options", "scene_or_orbit",
 ]  # fmt: skip
 
 _OLD = {
     ("--renderer", "torch"): "the renderer of this package is called builtin: --renderer builtin",
     ("--engine", "loops"): "this engine is called by what compiles it: --engine numba",
     ("--fields", None): "models that train side by side are called models: --models",
+    ("--preset", None): "it is --recipe now, and what was the preset fsgs is --recipe 3dgs",
+    ("--ply", None): "a PLY is given without an option: ca-reg evaluate FILE.ply",
+    ("--compensate", None): "it is an argument of --regularizer: 'dropout(0.2, compensate=True)'",
+    ("--clip-noise", None): "it is an argument of --regularizer: 'noise(0.8, clip=True)'",
+    ("--scale-noise", None): "it is an argument of --regularizer: 'noise(0.8, scale=True)'",
+    ("--lambda-dssim", None): "it is an argument of --loss: 'photometric(lambda_dssim=0.2)'",
+    ("--ca-weight", None): "it is a term of --loss: 'photometric + co_adaptation(3.0)'",
 }
 """Options, with the value that is refused or None for all, and what they are called now."""
 
@@ -85,7 +92,7 @@ class PlyScene(SceneOptions):
     init: Annotated[str | None, tyro.conf.Suppress] = None  # the PLY is the model
 
 
-def place_of(source: Path, scene: PlyScene, orbit: OrbitOptions) -> SceneOptions | OrbitOptions | None:
+def scene_or_orbit(source: Path, scene: PlyScene, orbit: OrbitOptions) -> SceneOptions | OrbitOptions | None:
     """Return the scene or orbit of a PLY; None for the folder of a run, which has its own scene.
 
     Options that do not apply are refused with a ValueError.
@@ -106,14 +113,14 @@ def place_of(source: Path, scene: PlyScene, orbit: OrbitOptions) -> SceneOptions
     return scene
 
 
-def check_model(source: Path, place: SceneOptions | OrbitOptions | None) -> None:
+def check_model(source: Path, where: SceneOptions | OrbitOptions | None) -> None:
     """Refuse a run, a PLY or its scene that is not there, with a FileNotFoundError that says what was expected."""
-    if place is None:
+    if where is None:
         check_run(source)
     elif not source.is_file():
         raise FileNotFoundError(f"there is no file {source}: expected a standard 3DGS .ply, or the folder of a run.")
-    elif isinstance(place, SceneOptions):
-        check_scenes([place.path])
+    elif isinstance(where, SceneOptions):
+        check_scenes([where.path])
 
 
 def check_ply(source: Path) -> None:
@@ -122,11 +129,11 @@ def check_ply(source: Path) -> None:
         raise ValueError(f"{source} is no PLY: give one, such as the point_cloud.ply of a run.")
 
 
-def check_out(out: Path | None, source: Path, place: SceneOptions | OrbitOptions | None = None) -> None:
-    """Refuse, with a ValueError, to write into the photographs of a run, or of a PLY whose `place_of` is given."""
+def check_out(out: Path | None, source: Path, where: SceneOptions | OrbitOptions | None = None) -> None:
+    """Refuse, with a ValueError, to write into the photographs of a run, or of a PLY, given its `scene_or_orbit`."""
     if out is not None:
         # Only its settings say where the photographs of a run are.
-        scene = read_run_settings(source / CONFIG)[0] if place is None else place
+        scene = read_run_settings(source / CONFIG)[0] if where is None else where
         check_output(out, scene.path if isinstance(scene, SceneOptions) else None, ())
 
 

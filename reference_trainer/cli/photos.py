@@ -162,14 +162,14 @@ class Run:
             paths = list_images(scene / "images")
         return max(map(image_size, paths), key=math.prod), len(paths)
 
-    def _makes_dense_start(self, options: SceneOptions, count: int, *, placed: bool) -> bool:
+    def _makes_dense_start(self, options: SceneOptions, count: int, *, posed: bool) -> bool:
         """Return whether the training begins with a dense start; how many points `poses` leaves is not known before."""
         from reference_trainer.scenes.dense import THIN, made_unasked
         from reference_trainer.scenes.load import load_scene
 
         if self.points != "auto":
             return self.points == "dense"
-        if not placed or not made_unasked(0, count):
+        if not posed or not made_unasked(0, count):
             return made_unasked(THIN, count)
         scene = load_scene(options, trains=False)
         return made_unasked(len(scene.points.positions), len(scene.train))
@@ -217,12 +217,12 @@ class Run:
         size = round(width / factor), round(height / factor)
         pixels, step = math.prod(size), step_seconds(*size, self.device)
         core = step if self.device == "cpu" else _REFERENCE * pixels  # cameras and points are found by the processor
-        times, placed = {}, scene == self.photos or bool(colmap_folders(scene))
-        if not placed:
+        times, posed = {}, scene == self.photos or bool(colmap_folders(scene))
+        if not posed:
             megapixels = math.prod(feature_size(width, height, few=count < FEW)) / 1e6
             work = count * megapixels * (10.0 if count < FEW else 2.0) + 0.025 * count * (count - 1) / 2
             times["poses"] = core / (_REFERENCE * pixels) * work
-        if not done and self._makes_dense_start(options, count, placed=placed):
+        if not done and self._makes_dense_start(options, count, posed=posed):
             times["points"] = core * _MATCHED * count * math.prod(matched_size(*size)) / pixels
         times["training"] = step * _TRAINING * (config.iterations - done)
         times["scores and page"] = step * _SHOWN * 3 * min(count, 8)

@@ -14,7 +14,11 @@ from reference_trainer.scenes.options import OrbitOptions
 
 __all__ = ["MOVED", "ErrorRuntime", "Stability", "Study"]
 
-MOVED = {"paper": "python -m benchmarks.paper", "attribution": "python -m benchmarks.attribution"}
+MOVED = {
+    "paper": "python -m benchmarks.paper",
+    "attribution": "python -m benchmarks.attribution",
+    "gaussian-shares": "python -m benchmarks.attribution",
+}
 """Former studies, which are evidence and no part of the installation: how they are called from a checkout."""
 
 
@@ -47,7 +51,7 @@ class ErrorRuntime:
 
 @dataclass(frozen=True)
 class Stability:
-    """Extreme cases of both engines against float64 and exact arithmetic: right, refused, or limits, from where on."""
+    """Extreme cases of the CPU's engines against float64 and exact arithmetic: right, refused, or limits, and where."""
 
     out: Path = Path("runs/stability")
     """Folder for the JSON, the tables and the picture."""

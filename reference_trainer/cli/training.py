@@ -154,12 +154,12 @@ class Train:
         pictures = between >= PICTURES_FROM if self.monitor_pictures == "auto" else self.monitor_pictures == "on"
         monitoring = Monitoring(self.monitor_every, pictures=pictures, sinks=self.log_to)
         with ExitStack() as stack:
-            watched: dict[str, Any] = {}
+            hooks: dict[str, Any] = {}
             if self.viewer is not None:
                 from reference_trainer.viewer.window import Viewer
 
                 viewer = stack.enter_context(Viewer(*self.viewer or (PORT,)))
-                watched = {"on_step": viewer.follow}
+                hooks = {"on_step": viewer.follow}
                 print(viewer)
             if self.config.renderer == "builtin":
                 self.rendering.begin(self.device, trains=True)
@@ -175,7 +175,7 @@ class Train:
                 monitoring=monitoring,
                 lpips=self.lpips,
                 progress=True,
-                **watched,
+                **hooks,
             )
         print_table(summary(results))
         out, trust = shlex.quote(str(self.out)), _trust(self.config, self.scene)

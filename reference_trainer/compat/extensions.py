@@ -49,8 +49,8 @@ def distCUDA2(points: Tensor) -> Tensor | tuple[Tensor, Tensor]:
 
     Callers that unpack the result, as FSGS and CoR-GS do, also get the indices of the neighbors, (N, 3) int32.
     """
-    squares, numbers = nearest_neighbors(points, 3)
-    return squares.mean(1) if names_of_results() is None else (squares.mean(1), numbers.int())
+    squares, indices = nearest_neighbors(points, 3)
+    return squares.mean(1) if names_of_results() is None else (squares.mean(1), indices.int())
 
 
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:

@@ -44,10 +44,10 @@ Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 def make_rasterization(original: Rasterization, *, per_axis: bool) -> Rasterization:
     """Make a function with the arguments and results of ``gsplat.rasterization``, for any device.
 
-    It draws the Gaussians that gsplat 1.5 draws, with its near plane, far plane and radii; all arguments but those that
-    affect only speed are obeyed or refused. Differences: alpha is clamped at 0.99, as in gsplat 1.6 (0.999 before), and
-    gradients pass the clamp; the projection is linearized within a margin around the middle of the picture, not around
-    the principal point; Gaussians fainter than 1/255 have no radius, with gsplat 1.4 too.
+    It renders the Gaussians that gsplat 1.5 renders, with its near plane, far plane and radii; all arguments but those
+    that affect only speed are obeyed or refused. Differences: alpha is clamped at 0.99, as in gsplat 1.6 (0.999
+    before), and gradients pass the clamp; the projection is linearized within a margin around the middle of the
+    picture, not around the principal point; Gaussians fainter than 1/255 have no radius, with gsplat 1.4 too.
 
     ``info`` holds ``means2d`` (pixels, part of the graph: `retain_grad` it; ``absgrad`` appears on it at the backward
     pass if it was asked for), ``radii``, ``depths``, ``opacities``, the numbers ``batch_ids``, ``camera_ids`` and
@@ -67,10 +67,10 @@ def make_rasterization(original: Rasterization, *, per_axis: bool) -> Rasterizat
         >>> def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane=0.01,
         ...                   far_plane=1e10, radius_clip=0.0, sh_degree=None, packed=True, backgrounds=None,
         ...                   render_mode="RGB", absgrad=False, rasterize_mode="classic", eps2d=0.3): ...
-        >>> draw_on_any_device = make_rasterization(rasterization, per_axis=True)
+        >>> render_on_any_device = make_rasterization(rasterization, per_axis=True)
         >>> one, pose = torch.ones(1, 3), torch.eye(4)[None]
         >>> intrinsics = torch.tensor([[[50.0, 0, 16], [0, 50, 16], [0, 0, 1]]])
-        >>> image, alpha, info = draw_on_any_device(
+        >>> image, alpha, info = render_on_any_device(
         ...     one * pose[0, 2, :3], pose[0, :1], 0.1 * one, one[0, :1], one, pose, intrinsics, 32, 32)
         >>> image.shape, alpha.shape, info["radii"].tolist()
         (torch.Size([1, 32, 32, 3]), torch.Size([1, 32, 32, 1]), [[17, 17]])
@@ -94,7 +94,7 @@ def make_rasterization(original: Rasterization, *, per_axis: bool) -> Rasterizat
 
 
 class _View(NamedTuple):
-    """What one camera sees: M of the N Gaussians; gsplat's radii (M, 2), 0 for what it does not draw.
+    """What one camera sees: M of the N Gaussians; gsplat's radii (M, 2), 0 for what it does not render.
 
     ``listed`` holds the indices of those with a radius, among the M.
     """
@@ -193,7 +193,7 @@ def _colors(given: SimpleNamespace, number: int) -> dict[str, Any]:
 
 @torch.no_grad()
 def _extents(splats: Splats, per_axis: bool) -> Tensor:
-    """Return half the sides of the rectangles that gsplat draws splats in, whole pixels, shape (M, 2)."""
+    """Return half the sides of the rectangles that gsplat renders splats in, whole pixels, shape (M, 2)."""
     # Since 1.5 a splat ends where its alpha falls to 1/255, on each axis; before, at three of its longest deviations.
     if per_axis:
         xx, _, yy = splats.projection.covariances.unbind(-1)

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor
 
-__all__ = ["SAY_IT", "Picture", "Unknown", "kinds_of", "names_of_results"]
+__all__ = ["SAY_IT", "Planes", "Unknown", "kinds_of", "names_of_results"]
 
 SAY_IT = (
     "say what it is with outputs=..., in the launcher --outputs: all values in their order, such as image,radii,depth, "
@@ -94,7 +94,7 @@ for _operator in (
     setattr(Unknown, f"__{_operator}__", Unknown._refuse)
 
 
-class Picture(Tensor):
+class Planes(Tensor):
     """Planes (C, H, W) that raise ValueError when asked for a channel that they lack.
 
     A slice beyond the end of a plain tensor would silently be empty. Results computed from planes are plain tensors; so
@@ -109,7 +109,7 @@ class Picture(Tensor):
         last = max(first.start or 0, (first.stop or 1) - 1) if isinstance(first, slice) else first
         if isinstance(last, int) and last >= len(self):
             raise ValueError(
-                f"channel {last} of a picture was asked for, but the stand-in rasterizer draws {len(self)} channels: "
+                f"channel {last} of a picture was asked for, but the stand-in rasterizer renders {len(self)} channels: "
                 f"{SAY_IT}; anything else needs CUDA."
             )
         return super().__getitem__(index)

@@ -65,7 +65,7 @@ def filtered(
 
 @torch.no_grad()
 def contributions(splats: Splats, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Sum over the pixels at which a splat is drawn: an image (H, W), ones, its blend weights, and its distances.
+    """Sum over the pixels at which a splat is rendered: an image (H, W), ones, its blend weights, and its distances.
 
     Each is (M,); distances are from the splat's center to the pixel, in pixels.
     """
@@ -76,11 +76,11 @@ def contributions(splats: Splats, image: Tensor) -> tuple[Tensor, Tensor, Tensor
     for block in blocks(splats.lists, rows.device):
         entries = rows[:, block.gaussians]
         weights = blend_weights(block.alphas(entries))
-        drawn = (weights > 0).to(weights)
+        covered = (weights > 0).to(weights)
         x, y = entries[:2, :, None]
         dx, dy = (pixels[i] + block.centers[i][..., None] - center for i, center in enumerate((x, y)))
         values, ones = inside[block.tiles], inside[block.tiles][:, 1:]
-        found = torch.cat([values @ drawn, ones @ weights, ones @ (drawn * torch.hypot(dx, dy))], dim=1)
+        found = torch.cat([values @ covered, ones @ weights, ones @ (covered * torch.hypot(dx, dy))], dim=1)
         sums.index_add_(1, block.gaussians.flatten(), found.transpose(0, 1).flatten(1))
     image_sums, counts, weight_sums, distances = sums[:, :-1]
     return image_sums, counts, weight_sums, distances
@@ -91,7 +91,7 @@ NEAR, FAR = 0.2, 100.0  # between which 2DGS maps depths to [0, 1] for its disto
 
 @torch.no_grad()
 def heaviest(splats: Splats) -> tuple[Tensor, Tensor]:
-    """Return the splat of the largest blend weight at every pixel, -1 where nothing is drawn, and that weight: (H, W).
+    """Return the splat of the largest blend weight at every pixel, -1 where there is none, and that weight: (H, W).
 
     Indices are those of the M splats, int64 (LoopSparseGS).
     """

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from reference_trainer.camera import Camera
 from reference_trainer.compat.extensions import Refusing, make_module
-from reference_trainer.compat.outputs import Picture, Unknown, kinds_of, names_of_results
+from reference_trainer.compat.outputs import Planes, Unknown, kinds_of, names_of_results
 from reference_trainer.compat.planes import contributions, filtered, heaviest, surface_planes
 from reference_trainer.model.gaussians import compute_relocation
 from reference_trainer.render import rasterize, splat
@@ -151,9 +151,9 @@ class GaussianRasterizer(nn.Module):
     [-1, 1]): half the width and height times the gradient per pixel. Its values are not read. With four columns, the
     last two receive the sums over the pixels of its absolute values (AbsGS).
 
-    Two things differ from the CUDA code. A splat is drawn wherever its alpha reaches 1/255; there it ends at the tiles
-    that meet a square of three standard deviations. And quaternions are normalized here, so that their gradient has no
-    component along them; the repositories normalize them before the call, with the same effect.
+    Two things differ from the CUDA code. A splat is rendered wherever its alpha reaches 1/255; there it ends at the
+    tiles that meet a square of three standard deviations. And quaternions are normalized here, so that their gradient
+    has no component along them; the repositories normalize them before the call, with the same effect.
 
     Args:
         raster_settings: of the view.
@@ -174,7 +174,7 @@ class GaussianRasterizer(nn.Module):
     def visible_filter(
         self, means3D: Tensor, scales: Tensor, rotations: Tensor, cov3D_precomp: Tensor | None = None
     ) -> Tensor:
-        """Return the radii of Gaussians, as `forward` does, without drawing them (Scaffold-GS)."""
+        """Return the radii of Gaussians, as `forward` does, without rendering them (Scaffold-GS)."""
         scales, rotations = self._axes(scales, rotations, cov3D_precomp)
         return visible_radii(means3D, rotations, scales, camera_of(self.raster_settings))
 
@@ -198,14 +198,14 @@ class GaussianRasterizer(nn.Module):
         ``means2D`` (N, 3) receives the screen-space gradients, the last columns of (N, 4) the sums of their absolute
         values over the pixels (AbsGS), as do the first two of ``means2D_densify`` (Deformable-3D-Gaussians).
         Colors are spherical-harmonic coefficients ``shs`` (N, K, 3), whose first band may stand apart in ``dc`` (N, 1,
-        3), or ``colors_precomp`` (N, 3). Scales (N, 2) are those of surfels (2DGS), which are drawn as flat Gaussians.
+        3), or ``colors_precomp`` (N, 3). Scales (N, 2) are those of surfels (2DGS), rendered as flat Gaussians.
         Further arguments are ignored, with a warning unless they are None, False or zeros.
 
         Returns:
             The values that the caller unpacks, told by its names, see `kinds_of`; by default first the image (3, H, W),
             not clamped, and radii in pixels, (N,) int32, 0 for what is out of view. Depth and inverse depth are sums
             of weight times (inverse) camera depth; they and alpha have shape (1, H, W). Weights are every Gaussian's
-            sum of weights over the pixels, shape (N,), pixels (N, 1) the number of those at which it is drawn, both
+            sum of weights over the pixels, shape (N,), pixels (N, 1) the number of those at which it is rendered, both
             without a gradient; so are the scores of Taming 3DGS, see `contributions`, the counts of FastGS (N,), and
             for every pixel the Gaussian of the largest weight, -1 for none, and that weight (1, H, W). Normals, mean
             depth and distortion are those of `surface_planes`.
@@ -278,16 +278,16 @@ class GaussianRasterizer(nn.Module):
             found["weights"] = means3D.new_zeros(n).index_copy(0, splats.indices, splat_weights(splats))
         if surfaces:
             found |= surface_planes(rendering._replace(splats=splats), means3D, rotations, scales, camera)
-        drawn = rendering.alpha.detach() > 0
+        covered = rendering.alpha.detach() > 0
         found["radii"] = visible_radii(means3D, rotations, scales, camera, blur=blur)
         if settings.pixel_weights is not None or "pixels" in parts:
-            image = (rendering.alpha if settings.pixel_weights is None else settings.pixel_weights).reshape(drawn.shape)
-            table = torch.stack([*contributions(splats, image), projection.depths.detach()])
+            image = rendering.alpha if settings.pixel_weights is None else settings.pixel_weights
+            table = torch.stack([*contributions(splats, image.reshape(covered.shape)), projection.depths.detach()])
             table = table.new_zeros(5, n).index_copy(1, splats.indices, table)
             found |= dict(zip(SCORES, table, strict=True)) | {"my_radii": found["radii"], "pixels": table[1, :, None]}
         if "metric_counts" in parts:
-            chosen = torch.zeros_like(drawn) if settings.metric_map is None else settings.metric_map == 1
-            count = contributions(splats, (chosen.view_as(drawn) & bool(settings.get_flag)).to(means3D))[0]
+            chosen = torch.zeros_like(covered) if settings.metric_map is None else settings.metric_map == 1
+            count = contributions(splats, (chosen.view_as(covered) & bool(settings.get_flag)).to(means3D))[0]
             found["metric_counts"] = means3D.new_zeros(n).index_copy(0, splats.indices, count).int()
         if not parts.isdisjoint(("heaviest", "largest_weight")):
             index, weight = heaviest(splats)
@@ -295,7 +295,7 @@ class GaussianRasterizer(nn.Module):
             index = torch.cat([splats.indices, splats.indices.new_tensor([-1])])[index]
             found |= {"heaviest": index[None].int(), "largest_weight": weight[None]}
         labels = (*(names or kinds), "radii")  # for a caller that names only one value
-        return tuple(_output(kind, label, found, drawn) for kind, label in zip(kinds, labels, strict=False))
+        return tuple(_output(kind, label, found, covered) for kind, label in zip(kinds, labels, strict=False))
 
     def _axes(
         self, scales: Tensor | None, rotations: Tensor | None, covariances: Tensor | None
@@ -310,21 +310,21 @@ class GaussianRasterizer(nn.Module):
         return lengths * self.raster_settings.scale_modifier, rotations
 
 
-def _output(kind: str | None, label: str | None, found: dict[str, Tensor], drawn: Tensor) -> Tensor | Unknown:
+def _output(kind: str | None, label: str | None, found: dict[str, Tensor], covered: Tensor) -> Tensor | Unknown:
     """Return a value as CUDA code would, its planes (..., H, W) stacked; an `Unknown` with its label if one is lacking.
 
     Planes are a copy, which the caller may overwrite (DNGaussian). Their gradient is taken only where something is
-    drawn: elsewhere that of depth / alpha, say, is nan (2DGS).
+    rendered: elsewhere that of depth / alpha, say, is nan (2DGS).
     """
     parts = str(kind).split("+")
     if not found.keys() >= set(parts):
         return Unknown(str(label))
-    if found[parts[0]].shape[-2:] != drawn.shape:
+    if found[parts[0]].shape[-2:] != covered.shape:
         return found[parts[0]]
     planes = torch.cat([found[part] for part in parts])
     if planes.requires_grad:
-        planes.register_hook(lambda gradient: torch.where(drawn, gradient, 0.0))  # type: ignore[no-untyped-call]
-    return planes.as_subclass(Picture)
+        planes.register_hook(lambda gradient: torch.where(covered, gradient, 0.0))  # type: ignore[no-untyped-call]
+    return planes.as_subclass(Planes)
 
 
 def _weighted(x: Tensor, weight: Tensor) -> Tensor:

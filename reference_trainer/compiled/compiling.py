@@ -105,7 +105,7 @@ class _UserCacheFiles(CompileResultCacheImpl):
     _locator_classes = (UserProvidedCacheLocator, _UserCache)  # the first is NUMBA_CACHE_DIR
 
 
-class _Kept(FunctionCache):
+class _KernelCache(FunctionCache):
     """Machine code on disk; a fault of the disk costs the time to compile, not the run."""
 
     _impl_class = _UserCacheFiles
@@ -133,7 +133,7 @@ class _Kept(FunctionCache):
             logging.getLogger(__name__).info("%s is not kept: %s", _name(self._py_func), error)
 
 
-class _NotKept(NullCache):
+class _NoKernelCache(NullCache):
     """No machine code on disk."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -151,9 +151,9 @@ def kernel(function: F) -> F:
     """
     compiled: Any = numba.njit(nogil=True, fastmath=_FAST, error_model="numpy")(function)
     try:
-        compiled._cache = _Kept(function)
+        compiled._cache = _KernelCache(function)
     except RuntimeError:  # "no locator available": the home cannot be written
-        compiled._cache = _NotKept(function)
+        compiled._cache = _NoKernelCache(function)
     KERNELS.append(compiled)
     result: F = compiled
     return result

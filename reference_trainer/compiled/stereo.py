@@ -32,7 +32,7 @@ _BEST = f4(0.6)  # weight of the better of several source views, for one of them
 
 
 @inlined
-def _bilinear(picture: Array, x: Any, y: Any, width: Any, height: Any) -> Any:
+def _bilinear(image: Array, x: Any, y: Any, width: Any, height: Any) -> Any:
     """Return a picture's value at a pixel position (centers at halves), that of the border outside."""
     x = min(max(x - _HALF, _ZERO), f4(width) - f4(1.001))
     y = min(max(y - _HALF, _ZERO), f4(height) - f4(1.001))
@@ -40,8 +40,8 @@ def _bilinear(picture: Array, x: Any, y: Any, width: Any, height: Any) -> Any:
     u, v = x - f4(j), y - f4(i)
     left, up = np.uint64(j), np.uint64(i)  # unsigned: an index below 0 would count from the end, which takes a test
     right, down = left + np.uint64(1), up + np.uint64(1)
-    top = picture[up, left] + u * (picture[up, right] - picture[up, left])
-    bottom = picture[down, left] + u * (picture[down, right] - picture[down, left])
+    top = image[up, left] + u * (image[up, right] - image[up, left])
+    bottom = image[down, left] + u * (image[down, right] - image[down, left])
     return top + v * (bottom - top)
 
 
@@ -130,7 +130,7 @@ def _mixed(scores: Array) -> Any:
 
 @kernel
 def aggregate(
-    first: int, last: int, dy: int, dx: int, picture: Array, cost: Array, total: Array, small: Any, large: Any
+    first: int, last: int, dy: int, dx: int, image: Array, cost: Array, total: Array, small: Any, large: Any
 ) -> None:
     """Add to ``total`` (H, W, D) the costs along parallel paths of one direction; items are the paths.
 
@@ -149,10 +149,10 @@ def aggregate(
             x = path if path < width else (0 if dx > 0 else width - 1)
         before, now = one, other
         before[:] = _ZERO
-        jump, least, value = _ZERO, _ZERO, picture[y, x]
+        jump, least, value = _ZERO, _ZERO, image[y, x]
         while 0 <= y < height and 0 <= x < width:
-            step = abs(picture[y, x] - value)
-            value = picture[y, x]
+            step = abs(image[y, x] - value)
+            value = image[y, x]
             jump = least + max(large / (_ONE + f4(20) * step), _TWO * small)
             costs, totals = cost[y, x], total[y, x]
             for d in range(planes):

@@ -229,9 +229,9 @@ def _measure(
             title = _titled("expected error", expected.psnr, "{:.1f} dB")
             panels.append((title, expected_error_picture(expected), of_errors))
         panels += [(_titled(name, x.value * 1e3, "{:.2f}e-3"), ca_picture(x), of_ca) for name, x in maps.items()]
-        titles, pictures, scales = zip(*panels, strict=True)
+        titles, images, scales = zip(*panels, strict=True)
         save_png(files[0], image)
-        save_png(files[1], side_by_side(pictures, titles, scales=scales))
+        save_png(files[1], side_by_side(images, titles, scales=scales))
     return measured
 
 

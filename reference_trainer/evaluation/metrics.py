@@ -128,10 +128,10 @@ def color_variance_map(splats: Splats) -> tuple[Tensor, Tensor]:
         >>> round(variance[8, 8].item(), 2)  # weights 1/2 and 1/4: (1/3) (2/3)
         0.22
     """
-    drawn = rasterize(splats)
-    covered = drawn.alpha > 0
-    weight = torch.where(covered, drawn.alpha, 1.0)
-    center = drawn.image.sum((1, 2)) / drawn.alpha.sum().clamp_min(torch.finfo(weight.dtype).tiny)
+    rendering = rasterize(splats)
+    covered = rendering.alpha > 0
+    weight = torch.where(covered, rendering.alpha, 1.0)
+    center = rendering.image.sum((1, 2)) / rendering.alpha.sum().clamp_min(torch.finfo(weight.dtype).tiny)
     offsets = splats.colors - center
     first, second = (rasterize(splats._replace(colors=x)).image / weight for x in (offsets, offsets.square()))
     return (second - first.square()).mean(0).clamp_min(0.0), covered
@@ -143,7 +143,7 @@ def first_order_map(splats: Splats, multiplier: Multiplier) -> Tensor:
 
     An approximation that ignores transmittance, the background and what lies behind a splat: hidden splats count like
     visible ones. `ca_reg.functional.first_order_variance` says when it holds. Arguments are those of `render_moments`,
-    of the multiplier only the variance counts; returns shape (3, H, W). Always drawn by the torch engine.
+    of the multiplier only the variance counts; returns shape (3, H, W). Always rendered by the torch engine.
 
     Example:
         >>> from reference_trainer.camera import Camera
@@ -159,5 +159,5 @@ def first_order_map(splats: Splats, multiplier: Multiplier) -> Tensor:
     if isinstance(spread, Tensor):
         spread = spread[splats.indices].to(splats.colors)[:, None]
     rows = torch.cat([geometry_rows(splats), (spread * splats.colors.square()).T])
-    behind = rows.new_zeros(3, splats.lists.height, splats.lists.width)
-    return walk(compositing.first_order, rows, behind, splats.lists, extra=0)
+    background = rows.new_zeros(3, splats.lists.height, splats.lists.width)
+    return walk(compositing.first_order, rows, background, splats.lists, extra=0)

@@ -72,10 +72,10 @@ def save_png(path: str | Path, image: Tensor) -> None:
     """
     from PIL.PngImagePlugin import PngInfo
 
-    picture, note = as_pillow(image), PngInfo()
+    pillow, note = as_pillow(image), PngInfo()
     note.add_text("Software", _MADE_BY)
     with replacing(path) as place:
-        picture.save(place, format="PNG", pnginfo=note)
+        pillow.save(place, format="PNG", pnginfo=note)
 
 
 def is_own_png(path: Path) -> bool:
@@ -117,7 +117,7 @@ def as_pillow(image: Tensor) -> Any:
     if image.ndim != 3 or image.shape[0] != 3:
         raise ValueError(f"expected an image of shape (3, H, W), got {tuple(image.shape)}.")
     if bool(image.isnan().any()):
-        raise ValueError("the image holds NaN; look for the cause in the rendering, or draw it with heat_map.")
+        raise ValueError("the image holds NaN; look for the cause in the rendering, or show it with heat_map.")
     pixels = (image.detach().clamp(0, 1) * 255).round().to("cpu", torch.uint8)
     return Image.fromarray(pixels.permute(1, 2, 0).contiguous().numpy())
 
@@ -186,7 +186,7 @@ def side_by_side(
     """Arrange pictures (3, H, W) in [0, 1] of one size in a grid, each with a label above, with thin white gaps.
 
     A column is at least as wide as its labels. Without ``columns`` all pictures form one row. ``scales`` are the ends
-    of each picture's color bar, which is drawn below it; None for a picture without. Returns colors in [0, 1], (3, H',
+    of each picture's color bar, which is put below it; None for a picture without. Returns colors in [0, 1], (3, H',
     W'), on the CPU, rounded to bytes. Raises ValueError if there is no image, the sizes or the numbers differ, or
     ``columns`` is not positive.
 
@@ -199,31 +199,31 @@ def side_by_side(
     scales = scales or [None] * len(images)
     if not images or not len(images) == len(labels) == len(scales):
         raise ValueError(f"expected one label for each of at least one image, got {len(images)} and {len(labels)}.")
-    pictures = [as_pillow(image) for image in images]
-    if len({picture.size for picture in pictures}) != 1:
+    panels = [as_pillow(image) for image in images]
+    if len({panel.size for panel in panels}) != 1:
         raise ValueError(f"the images must have one size, got {[tuple(image.shape) for image in images]}.")
     columns = min(len(images), len(images) if columns is None else columns)
     if columns < 1:
         raise ValueError(f"columns must be positive, got {columns}.")
-    width, height = pictures[0].size
+    width, height = panels[0].size
     cell = _LINE + height + (_BAR + _LINE + 2 if any(scales) else 0) + _GAP
     needed = [max(width, math.ceil(label_font().getlength(label)) + 4) for label in labels]
     widths = [max(needed[column::columns]) for column in range(columns)]
     size = (sum(widths) + (columns - 1) * _GAP, -(-len(images) // columns) * cell - _GAP)
     sheet = Image.new("RGB", size, "white")
     pen = ImageDraw.Draw(sheet)
-    for index, (picture, label, scale) in enumerate(zip(pictures, labels, scales, strict=True)):
+    for index, (panel, label, scale) in enumerate(zip(panels, labels, scales, strict=True)):
         row, column = divmod(index, columns)
         left, top = sum(widths[:column]) + column * _GAP, row * cell
         pen.text((left + 2, top + 1), label, fill="black", font=label_font())
-        sheet.paste(picture, (left, top + _LINE))
+        sheet.paste(panel, (left, top + _LINE))
         if scale:
             sheet.paste(as_pillow(color_bar(*scale, width=width)), (left, top + _LINE + height + 2))
     return torch.from_numpy(np.array(sheet)).permute(2, 0, 1) / 255
 
 
 def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
-    """Draw CA and PSNR of several runs, folders by label, against the iteration (paper, training dynamics)."""
+    """Plot CA and PSNR of several runs, folders by label, against the iteration (paper, training dynamics)."""
     with new_figure(path) as figure:
         figure.set_size_inches(WIDTH, 4.4)
         colors = {label: color(label, number) for number, label in enumerate(runs)}

@@ -116,9 +116,10 @@ class TrainedModel:
         The background is the model's own, or one of shape (3,) or (3, H, W); the pixels' weights have shape (H, W). The
         result is float64, shape (N,), 0 for Gaussians outside the view.
         """
-        splats, behind = self.splats(opacities, view), self.background if background is None else background
+        splats = self.splats(opacities, view)
+        background = self.background if background is None else background
         shares = torch.zeros(len(self.gaussians), dtype=torch.float64, device=opacities.device)
-        shares[splats.indices] = variance_shares(splats, multiplier, weights, background=behind)
+        shares[splats.indices] = variance_shares(splats, multiplier, weights, background=background)
         return shares
 
     def splats(self, opacities: Tensor, view: Viewpoint) -> Splats:
@@ -146,7 +147,7 @@ class MaskedRenders:
     """The render function of a `CAScore` for a model that does not change.
 
     Projection, colors and sorted tile lists are computed once per view, for all Gaussians, and all masks of a view are
-    drawn in one pass. The images are those of `TrainedModel.render`.
+    rendered in one pass. The images are those of `TrainedModel.render`.
     """
 
     def __init__(self, model: TrainedModel) -> None:

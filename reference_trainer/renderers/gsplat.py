@@ -50,7 +50,7 @@ class GsplatRenderer(Renderer):
         self._render = load_gsplat_render(device)
 
     def __call__(self, **arguments: Any) -> Any:
-        """Draw."""
+        """Render."""
         return self._render(**arguments)
 
 

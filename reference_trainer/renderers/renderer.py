@@ -14,7 +14,7 @@ __all__ = ["BuiltinRenderer", "Renderer"]
 
 
 class Renderer(abc.ABC):
-    """Draws Gaussians, with the arguments of `reference_trainer.render.render`; custom renderers are subclasses.
+    """Renders Gaussians, with the arguments of `reference_trainer.render.render`; custom renderers are subclasses.
 
     Attributes:
         capabilities: besides image and alpha: ``"depth"``; ``"moments"`` if `reference_trainer.render.render_moments`
@@ -44,7 +44,7 @@ class BuiltinRenderer(Renderer):
     capabilities = frozenset({"depth", "moments", "absgrad"})
 
     def __call__(self, *, absgrad: bool = False, **arguments: Any) -> Any:
-        """Draw."""
+        """Render."""
         out = render(**arguments)
         # Without gradients there is nothing to take absolute values of.
         if absgrad and out.splats.projection.means.requires_grad:

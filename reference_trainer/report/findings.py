@@ -43,7 +43,7 @@ class Findings:
     Args:
         label: what the page calls it.
         model: at its last checkpoint.
-        opacities: that the page draws it with, (N,).
+        opacities: that the page renders it with, (N,).
         scene: what it was trained on.
         views: that it is shown from, by split, those that were not trained on first if they have photographs.
         pictures: per view, ``"render"`` and where they exist ``"error"``, ``"expected error"`` and ``"co-adaptation"``,
@@ -70,7 +70,7 @@ class Findings:
     veils: Mapping[str, str] = field(default_factory=dict)
 
     def packed(self, low: float, high: float) -> dict[str, Any]:
-        """Return the model as the page draws it: its Gaussians in the order of their heat, those of least heat first.
+        """Return the model as the page renders it: its Gaussians in the order of their heat, those of least heat first.
 
         ``values`` are `quantized` columns: the position (3) less ``center``, in units of ``scale`` and as
         sign(x) log(1 + |x|), the logarithm of the scales (3), the quaternion (4, wxyz), opacity, color of the heat (3),
@@ -128,7 +128,7 @@ class Findings:
 
 @torch.no_grad()
 def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Collection[str] = ()) -> Findings:
-    """Draw a run's last checkpoint from its views, and attribute the exact score at drop rate 1/2 to its Gaussians.
+    """Render a run's last checkpoint from its views, and attribute the exact score at drop rate 1/2 to its Gaussians.
 
     The expected error follows from the model and the training photographs, so these have none themselves.
 
@@ -145,7 +145,7 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Colle
     model, scene = load_run_model(run, device, trust=trust)
     notes: list[str] = []
     if model.depends_on_camera:
-        notes.append(f"{label}: its test-time opacities depend on the camera; the model is drawn with the plain ones.")
+        notes.append(f"{label}: its test-time opacities depend on the camera; it is rendered with the plain ones.")
     last = "train" if scene.test else ""  # what can be compared with a photograph comes first
     found = sorted(measured_views(scene).items(), key=lambda item: (item[0] == last, item[0] != "train"))
     chosen = {split: [of[i].to(device) for i in evenly_spaced(len(of), min(views, len(of)))] for split, of in found}

@@ -30,9 +30,9 @@ def heat_uri(image: Tensor) -> str:
     return _uri(as_pillow(image).quantize(48, dither=0).convert("RGB"), "webp", lossless=True, method=6)
 
 
-def _uri(picture: Any, kind: str, **options: Any) -> str:
+def _uri(image: Any, kind: str, **options: Any) -> str:
     file = BytesIO()
-    picture.save(file, kind.upper(), **options)
+    image.save(file, kind.upper(), **options)
     return f"data:image/{kind};base64,{b64encode(file.getvalue()).decode()}"
 
 

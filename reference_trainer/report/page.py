@@ -339,7 +339,7 @@ def _flight(each: Findings) -> list[list[float]]:
 
 
 def _views(found: Sequence[Findings]) -> list[dict[str, Any]]:
-    """Return every view with its camera, its photograph, and the pictures of every run that was drawn there."""
+    """Return every view with its camera, its photograph, and the pictures of every run that was rendered there."""
     views: dict[tuple[str, str, str], dict[str, Any]] = {}
     for number, each in enumerate(found):
         pictures = iter(each.pictures)

@@ -173,7 +173,7 @@ def save(comparison: Comparison, out: Path) -> None:
 
 
 def report(comparisons: Mapping[Path, Comparison]) -> None:
-    """Log the table of every scene, draw the figures of its first seed, and name the runs that failed."""
+    """Log the table of every scene, plot the figures of its first seed, and name the runs that failed."""
     for out, comparison in comparisons.items():
         _log.info(f"\n{out.name}:\n" if len(comparisons) > 1 else "")
         if comparison.runs:
@@ -188,7 +188,7 @@ def report(comparisons: Mapping[Path, Comparison]) -> None:
 
 
 def _report(comparison: Comparison, out: Path) -> None:
-    """Log the table of one scene and draw its figures."""
+    """Log the table of one scene and plot its figures."""
     _log.info(comparison_table(comparison.runs))
     first = {name: out / name / f"seed_{of[0]['config']['seed']}" for name, of in comparison.runs.items()}
     try:
@@ -197,13 +197,14 @@ def _report(comparison: Comparison, out: Path) -> None:
     except (FileNotFoundError, ValueError) as error:  # runs of --monitor-every 0
         _log.info("no figure of CA and PSNR against the iteration: %s", error)
     views = next(iter(comparison.runs.values()))[0]["views"]
-    splits, drawn = {view["split"] for view in views}, list[Path]()
+    splits, figures = {view["split"] for view in views}, list[Path]()
     try:
         for split in sorted(splits - {"train"}) or splits:
             for name in file_names([view["name"] for view in views if view["split"] == split]):
-                drawn.append(out / f"{split}_{name}.png")
-                comparison_figure(first, drawn[-1], view=name, split=split)
-        _log.info("every view under each strategy: %s%s", drawn[0], f" and {len(drawn) - 1} more" * (len(drawn) > 1))
+                figures.append(out / f"{split}_{name}.png")
+                comparison_figure(first, figures[-1], view=name, split=split)
+        more = f" and {len(figures) - 1} more" * (len(figures) > 1)
+        _log.info("every view under each strategy: %s%s", figures[0], more)
     except FileNotFoundError as error:  # somebody has deleted them
         _log.info("no pictures of the views under each strategy: %s", error)
     _log.info(

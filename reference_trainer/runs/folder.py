@@ -132,9 +132,9 @@ def check_output(folder: Path, scene: str | Path | None, files: Collection[str])
     """
     if scene not in (None, "synthetic") and folder.exists() and folder.resolve() == Path(str(scene)).resolve():
         raise ValueError(f"{folder} is the folder of the scene, to which nothing is written: give another --out.")
-    if foreign := [name for name in files if (folder / name).exists()]:
+    if existing := [name for name in files if (folder / name).exists()]:
         raise ValueError(
-            f"{folder} holds {', '.join(foreign)}, but nothing says that this command wrote it: give another --out."
+            f"{folder} holds {', '.join(existing)}, but nothing says that this command wrote it: give another --out."
         )
 
 

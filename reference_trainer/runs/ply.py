@@ -251,13 +251,13 @@ def log_other_frame(result: Evaluation, scene: Scene, ply: Path) -> None:
 def _other_size(ply: Path, scene: Scene) -> list[str]:
     """Return a note if the PLY lies in a run whose training views were larger or smaller than those of the scene."""
     for view, name in zip(scene.train, file_names([view.name for view in scene.train]), strict=True):
-        picture = ply.parent / VIEWS / "train" / f"{name}.png"
-        if picture.is_file() and is_own_png(picture):
-            (width, height), camera = image_size(picture), view.camera
+        file = ply.parent / VIEWS / "train" / f"{name}.png"
+        if file.is_file() and is_own_png(file):
+            (width, height), camera = image_size(file), view.camera
             if (width, height) == (camera.width, camera.height):
                 return []
             return [
-                f"{ply} was trained at {width}x{height}, the size of its pictures in {picture.parent}, and is measured "
+                f"{ply} was trained at {width}x{height}, the size of its pictures in {file.parent}, and is measured "
                 f"at {camera.width}x{camera.height}: its own scores are no comparison. --downscale gives its size."
             ]
     return []
@@ -271,14 +271,14 @@ def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[st
     """Count, before anything is rendered, the Gaussians that the cameras of a scene, of both splits, see.
 
     A Gaussian counts if its center is beyond the near plane (0.2) and inside the picture, and its opacity is at least
-    1/255: fainter ones are never drawn. Returns doubts for people: a line about the cameras that see less than 1 % of
-    the model, which messages call ``name``; nothing if all see more.
+    1/255: fainter ones are never rendered. Returns doubts for people: a line about the cameras that see less than 1 %
+    of the model, which messages call ``name``; nothing if all see more.
 
     Raises:
-        ValueError: if no Gaussian can be drawn, or all cameras together see less than 1 %.
+        ValueError: if no Gaussian can be rendered, or all cameras together see less than 1 %.
     """
-    drawn = gaussians[gaussians.opacities >= MIN_ALPHA]
-    count, means = len(drawn), drawn.means
+    visible = gaussians[gaussians.opacities >= MIN_ALPHA]
+    count, means = len(visible), visible.means
     if not count:
         raise ValueError(
             f"{name}: none of the {len(gaussians):,} Gaussians has an opacity of 1/255, all are invisible."
@@ -288,14 +288,14 @@ def check_frame(gaussians: Gaussians, scene: Scene, name: str | Path) -> list[st
     inside = torch.stack([view.camera.inside(*view.camera.project(means)) for view in views]) & before
     seen = int(inside.any(0).sum())
     if seen < NEARLY_NONE * count:
-        behind = int((~before).all(0).sum())
+        behind_all = int((~before).all(0).sum())
         center = means.double().median(0).values
         reach = (means - center).norm(dim=1).kthvalue(-(-98 * count // 100)).values  # without stray ones
         rig = torch.stack([view.camera.position for view in views]).double()
         forward = torch.stack([view.camera.forward for view in views]).double().mean(0)
         raise ValueError(
             f"the cameras of {scene.name} do not see {name}: of {count:,} Gaussians, {seen:,} ({seen / count:.2%}) are "
-            f"in any of the {len(views)} pictures, {behind:,} are behind all cameras. The model lies around "
+            f"in any of the {len(views)} pictures, {behind_all:,} are behind all cameras. The model lies around "
             f"{_text(center)} within {reach:.3g}; the cameras stand around {_text(rig.mean(0))} within "
             f"{(rig - rig.mean(0)).norm(dim=1).max():.3g} and look towards {_text(forward)} on average. Both must be "
             "in one frame: give the files that the model was trained with (see --format: COLMAP, LLFF and Blender "

@@ -358,7 +358,7 @@ def _measure(
         perceptual=perceptual,
         pictures=out / VIEWS,
         partial=partial,
-        on_view=lambda: on_step(trainer),  # keeps an open viewer page drawn while views are measured
+        on_view=lambda: on_step(trainer),  # keeps an open viewer page up to date while views are measured
     )
     results = {
         "scene": trainer.scene.name,

@@ -8,7 +8,7 @@ from typing import Any
 from reference_trainer.scenes._colmap_model import READERS, ColmapModel, PointRecords
 from reference_trainer.scenes.formats import Capture, SceneFormat
 from reference_trainer.scenes.frames import Frame
-from reference_trainer.scenes.images import match_images, picture_folder
+from reference_trainer.scenes.images import image_folder, match_images
 from reference_trainer.scenes.options import SceneOptions
 
 __all__ = ["COLMAP", "colmap_folders", "colmap_frames", "is_colmap", "read_colmap"]
@@ -87,7 +87,7 @@ def _has(folder: Path, stem: str) -> bool:
 def _read_scene(root: Path, options: SceneOptions) -> Capture:
     """Read a scene folder."""
     folder = (colmap_folders(root) or [root / "sparse" / "0"])[0]  # the fallback's error says what is missing
-    return Capture(colmap_frames(read_colmap(folder), picture_folder(root, options.images)))
+    return Capture(colmap_frames(read_colmap(folder), image_folder(root, options.images)))
 
 
 COLMAP = SceneFormat(

@@ -30,7 +30,7 @@ SOURCE = "dense stereo"
 """What such a cloud names as its `source`."""
 
 COUNT = 15_000
-LEAST = 1_000
+MIN_POINTS = 1_000
 THIN = 1_000  # measured points; to fewer, random ones are added where a dense start cannot be
 ENOUGH = 10_000  # measured points, to which none are added unasked
 MOST, MOST_IF_THIN = 10, 16  # photographs to measure on unasked: each takes five seconds of a core
@@ -49,7 +49,7 @@ BAR = {"desc": "points", "unit": "photo", "delay": 2.0}
 SMALL, LARGE = 0.03, 0.35  # costs of a step between planes, where a correlation of -1 costs 1
 
 
-class _Picture(NamedTuple):
+class _Image(NamedTuple):
     """A photograph as the loops need it: gray around 0, its colors, its camera, and where it shows anything."""
 
     gray: NDArray[np.float32]
@@ -118,28 +118,28 @@ def _check(views: Sequence[View]) -> None:
 
 def _enough(cloud: PointCloud, views: Sequence[View], count: int) -> PointCloud:
     """Return the cloud, if its points are enough to start from."""
-    if len(cloud.positions) < min(LEAST, count // 2):
+    if len(cloud.positions) < min(MIN_POINTS, count // 2):
         raise ValueError(
             f"a dense start found only {len(cloud.positions)} points on which the {len(views)} training photographs "
-            f"agree, at least {LEAST:,} are needed: they lack texture or overlap, or the cameras are wrong. Choose "
-            "other points."
+            f"agree, at least {MIN_POINTS:,} are needed: they lack texture or overlap, or the cameras are wrong. "
+            "Choose other points."
         )
     return cloud
 
 
 def _measure(views: Sequence[View], guide: PointCloud | None, count: int) -> PointCloud:
     """Return at most so many points on which the photographs agree, which may be none."""
-    pictures = [_picture(view, PIXELS) for view in views]
-    cameras = [picture.camera for picture in pictures]
+    images = [_image(view, PIXELS) for view in views]
+    cameras = [image.camera for image in images]
     ranges = [_guided(camera, guide) for camera in cameras]
     if None in ranges:
-        small = [_picture(view, COARSE) for view in views]
+        small = [_image(view, COARSE) for view in views]
         found = _agreed(small, _depth_maps(small, [_visible(cameras, i) for i in range(len(cameras))]))
         cloud = None if found is None else PointCloud(found[0], found[1], "")
         ranges = [
             _guided(camera, cloud) if known is None else known for camera, known in zip(cameras, ranges, strict=True)
         ]
-    agreed = _agreed(pictures, _depth_maps(pictures, ranges)) or (torch.empty(0, 3), torch.empty(0, 3), torch.empty(0))
+    agreed = _agreed(images, _depth_maps(images, ranges)) or (torch.empty(0, 3), torch.empty(0, 3), torch.empty(0))
     positions, colors, confidence = _thinned(*agreed, cameras, count)
     return PointCloud(positions, colors, SOURCE, frozenset(view.name for view in views), confidence)
 
@@ -153,7 +153,7 @@ def dense_start(views: Sequence[View], measured: PointCloud) -> tuple[PointCloud
     `dense_points`.
     """
     _check(views)
-    dense = _enough(_kept(views, measured), views, COUNT)
+    dense = _enough(_cached(views, measured), views, COUNT)
     assert dense.confidence is not None
     number, more = len(dense.positions), len(measured.positions)
     note = f"initial points: {number:,} measured on the {len(views)} training photographs by dense stereo"
@@ -169,7 +169,7 @@ def dense_start(views: Sequence[View], measured: PointCloud) -> tuple[PointCloud
     return cloud, f"{note}, and {more:,} from {measured.source}"
 
 
-def _kept(views: Sequence[View], guide: PointCloud) -> PointCloud:
+def _cached(views: Sequence[View], guide: PointCloud) -> PointCloud:
     """Return what `_measure` finds, which is kept in the cache folder even if it is too little."""
     names = frozenset(view.name for view in views)
     digest = hashlib.sha256(guide.positions.numpy().tobytes())
@@ -183,10 +183,10 @@ def _kept(views: Sequence[View], guide: PointCloud) -> PointCloud:
     path: Path | None = None
     try:
         path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "ca_reg", f"{digest.hexdigest()}.npz")
-        with np.load(path) as kept:
-            parts = [torch.from_numpy(kept[name]) for name in ("positions", "colors", "confidence")]
+        with np.load(path) as cached:
+            parts = [torch.from_numpy(cached[name]) for name in ("positions", "colors", "confidence")]
         return PointCloud(parts[0], parts[1], SOURCE, names, parts[2])
-    except Exception:  # nothing is kept, or a damaged file, which may raise anything
+    except Exception:  # nothing is cached, or a damaged file, which may raise anything
         pass
     cloud = _measure(views, guide, COUNT)
     assert cloud.confidence is not None
@@ -267,7 +267,7 @@ def _guided(camera: Camera, guide: PointCloud | None) -> tuple[float, float] | N
     return 0.8 * near, 1.6 * far
 
 
-def _picture(view: View, most: int) -> _Picture:
+def _image(view: View, most: int) -> _Image:
     """Prepare a photograph, made smaller to at most so many pixels."""
     height, width = view.image.shape[1:]
     size = matched_size(width, height, most)
@@ -275,7 +275,7 @@ def _picture(view: View, most: int) -> _Picture:
     gray = colors.mean(0).numpy()
     gray = gray - gray.mean()  # numpy's: the last bits of torch's mean depend on the number of threads
     solid = torch.ones(size[::-1]) if view.alpha is None else resize_image(view.alpha[None], *size, "bilinear")[0]
-    return _Picture(gray, colors, view.camera.resized(*size), solid > 0.5)
+    return _Image(gray, colors, view.camera.resized(*size), solid > 0.5)
 
 
 def _map(one: Camera, other: Camera) -> NDArray[np.float32]:
@@ -295,23 +295,23 @@ def _stacked(layers: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32]
     return np.stack(padded), sizes
 
 
-def _depth_maps(pictures: Sequence[_Picture], ranges: Sequence[tuple[float, float] | None]) -> list[_Depths | None]:
+def _depth_maps(images: Sequence[_Image], ranges: Sequence[tuple[float, float] | None]) -> list[_Depths | None]:
     """Measure the depth of every pixel of every picture that has a range and source views."""
     from reference_trainer.compiled import stereo
     from reference_trainer.compiled.threads import in_threads
 
     found: list[_Depths | None] = []
-    cameras = [picture.camera for picture in pictures]
-    every = zip(pictures, ranges, strict=True)
-    for number, (picture, span) in enumerate(progress_bar(iterable=every, total=len(pictures), **BAR)):
+    cameras = [image.camera for image in images]
+    every = zip(images, ranges, strict=True)
+    for number, (image, span) in enumerate(progress_bar(iterable=every, total=len(images), **BAR)):
         sources = [] if span is None else source_views(cameras, number, math.sqrt(span[0] * span[1]))
         if span is None or not sources:
             found.append(None)
             continue
-        gray, (height, width) = picture.gray, picture.gray.shape
-        images, sizes = _stacked([pictures[s].gray for s in sources])
-        maps = np.stack([_map(picture.camera, cameras[s]) for s in sources])
-        inverses = _planes(picture.camera, maps, *span)
+        gray, (height, width) = image.gray, image.gray.shape
+        grays, sizes = _stacked([images[s].gray for s in sources])
+        maps = np.stack([_map(image.camera, cameras[s]) for s in sources])
+        inverses = _planes(image.camera, maps, *span)
         pooled = torch.from_numpy(gray)[None]
         moments = [
             torch.nn.functional.avg_pool2d(x, 2 * r + 1, 1, r, count_include_pad=False)[0].numpy()
@@ -321,7 +321,7 @@ def _depth_maps(pictures: Sequence[_Picture], ranges: Sequence[tuple[float, floa
         variances = np.maximum(np.stack(moments[2:]) - means**2, 0)
         cost = np.empty((height, width, len(inverses)), np.float32)
         strips = -(-height // stereo.STRIP)
-        given = gray, means, variances, images, sizes, maps, inverses, cost
+        given = gray, means, variances, grays, sizes, maps, inverses, cost
         in_threads(stereo.sweep, strips, *given, least=1)
         total = np.zeros_like(cost)
         for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
@@ -335,7 +335,7 @@ def _depth_maps(pictures: Sequence[_Picture], ranges: Sequence[tuple[float, floa
             step = np.float32((inverses[1] - inverses[0]) / 2 ** (turn + 1))
             ends = np.array([inverses[0], inverses[-1]])
             reach, kept = (5, 3, 1)[turn], (ends, planes, new, scores)
-            in_threads(stereo.refine, height, gray, images, sizes, maps, step, reach, *kept, least=8)
+            in_threads(stereo.refine, height, gray, grays, sizes, maps, step, reach, *kept, least=8)
             planes, new = new, planes
         found.append(_Depths(planes, scores, sources))
     return found
@@ -376,22 +376,22 @@ def _planes(camera: Camera, maps: NDArray[np.float32], near: float, far: float) 
     return np.linspace(1 / far, 1 / near, count, dtype=np.float32)
 
 
-def _agreed(pictures: Sequence[_Picture], maps: Sequence[_Depths | None]) -> tuple[Tensor, Tensor, Tensor] | None:
+def _agreed(images: Sequence[_Image], maps: Sequence[_Depths | None]) -> tuple[Tensor, Tensor, Tensor] | None:
     """Return positions, colors and confidences of all pixels whose depth other views confirm; None if there are none.
 
     The confidence is the correlation times the share of the source views that agree.
     """
     parts = []
-    for picture, depths in zip(pictures, maps, strict=True):
+    for image, depths in zip(images, maps, strict=True):
         if depths is None:
             continue
         known = torch.from_numpy(depths.planes[0]) > 0
         rows, columns = known.nonzero().unbind(1)
         pixels, inverse = torch.stack([columns, rows], 1) + 0.5, torch.from_numpy(depths.planes[0])[known]
-        points, scores = picture.camera.lift(pixels, 1 / inverse), torch.from_numpy(depths.scores)[known]
+        points, scores = image.camera.lift(pixels, 1 / inverse), torch.from_numpy(depths.scores)[known]
         agreeing, total = torch.zeros_like(inverse), inverse.clone()
         for source in depths.sources:
-            other, camera = maps[source], pictures[source].camera
+            other, camera = maps[source], images[source].camera
             if other is None:
                 continue
             # To the source, from there at the source's own depth, and back: to the same pixel and the same depth?
@@ -401,7 +401,7 @@ def _agreed(pictures: Sequence[_Picture], maps: Sequence[_Depths | None]) -> tup
             there, slope_x, slope_y = torch.from_numpy(other.planes)[:, cell[:, 1], cell[:, 0]]
             offset = reached - cell - 0.5
             same &= there > 0
-            again, depth = picture.camera.project(
+            again, depth = image.camera.project(
                 camera.lift(reached, 1 / (there + slope_x * offset[:, 0] + slope_y * offset[:, 1]))
             )
             same &= ((again - pixels).norm(dim=1) <= NEAR) & ((1 / depth - inverse).abs() <= ALIKE * inverse)
@@ -410,10 +410,10 @@ def _agreed(pictures: Sequence[_Picture], maps: Sequence[_Depths | None]) -> tup
         kept = (agreeing > 1) & (scores > 0.5) | (agreeing > 0) & (scores > 0.8)
         fused = torch.zeros(known.shape)
         fused[known] = (total / (agreeing + 1)).where(kept, 0)
-        kept = _supported(fused) & picture.solid
-        positions = picture.camera.lift(kept.nonzero().flip(1) + 0.5, 1 / fused[kept])
+        kept = _supported(fused) & image.solid
+        positions = image.camera.lift(kept.nonzero().flip(1) + 0.5, 1 / fused[kept])
         confidence = (scores.clamp(0, 1) * agreeing / len(depths.sources))[kept[known]]
-        parts.append((positions, picture.colors[:, kept].T, confidence))
+        parts.append((positions, image.colors[:, kept].T, confidence))
     if not parts:
         return None
     positions, colors, confidence = (torch.cat(part) for part in zip(*parts, strict=True))

@@ -120,13 +120,13 @@ def read_depth(path: str | Path) -> Tensor:
                 array = np.array(file if file.mode != "P" else file.convert("RGB"))
     except Exception as error:  # each reader raises its own types
         raise ValueError(f"{path} is not a readable .npy file or PNG: {error}") from error
-    picture = np.squeeze(array)
-    if picture.ndim != 2 or picture.dtype.kind not in "fiu":
+    values = np.squeeze(array)
+    if values.ndim != 2 or values.dtype.kind not in "fiu":
         raise ValueError(
             f"{path} must hold one number for each pixel, shape (H, W), got {array.shape} of {array.dtype}: a colored "
             "picture of depth cannot be read back."
         )
-    depth = torch.from_numpy(picture.astype(np.float32))
+    depth = torch.from_numpy(values.astype(np.float32))
     return depth.where(depth.isfinite(), torch.nan)
 
 

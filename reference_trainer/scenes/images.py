@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 __all__ = [
-    "composite", "decode_image", "image_size", "is_image", "list_images", "match_images", "opened_image",
-    "path_inside", "picture_folder", "read_image", "resize_image", "unreadable_photographs",
+    "composite", "decode_image", "image_folder", "image_size", "is_image", "list_images", "match_images",
+    "opened_image", "path_inside", "read_image", "resize_image", "unreadable_photographs",
 ]  # fmt: skip
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
@@ -26,7 +26,7 @@ OTHER_PHOTOGRAPHS = frozenset(
 # Otherwise Pillow tries every format it knows, whatever the file's name, and hands PostScript to Ghostscript.
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
 LARGEST_IMAGE = 100_000_000  # pixels: a header can announce any number, and each takes 25 bytes of memory
-LARGE_PICTURE = 500_000  # pixels: about a second per training step on a CPU; larger pictures are reduced
+LARGE_IMAGE = 500_000  # pixels: about a second per training step on a CPU; larger pictures are reduced
 _BAND = 100_000  # pixels converted at a time
 
 
@@ -43,13 +43,13 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
         ValueError: if the file is not an image, is damaged, has more than 8 bits per channel or more than 100 million
             pixels.
     """
-    picture = decode_image(path)
-    width, height, has_alpha = picture.width, picture.height, picture.mode == "RGBA"
+    decoded = decode_image(path)
+    width, height, has_alpha = decoded.width, decoded.height, decoded.mode == "RGBA"
     image = torch.empty(3, height, width)
     alpha = torch.empty(height, width) if has_alpha else None
     rows = max(1, _BAND // width)
     for top in range(0, height, rows):
-        band = np.array(picture.crop((0, top, width, min(top + rows, height))))
+        band = np.array(decoded.crop((0, top, width, min(top + rows, height))))
         channels = torch.from_numpy(band).permute(2, 0, 1).to(torch.float32) / 255
         image[:, top : top + rows] = channels[:3]
         if alpha is not None:
@@ -193,7 +193,7 @@ def path_inside(root: str | Path, relative: str) -> Path:
     return Path(root) / normal
 
 
-def picture_folder(root: Path, name: str | None, usual: str = "images") -> Path:
+def image_folder(root: Path, name: str | None, usual: str = "images") -> Path:
     """Return the folder of a scene's photographs: the named one, or a default.
 
     The default is the first of ``<usual>`` and the ``<usual>_<factor>`` beside it, by increasing factor, whose pictures
@@ -220,4 +220,4 @@ def picture_folder(root: Path, name: str | None, usual: str = "images") -> Path:
         )
     if len(found) == 1:
         return found[0]
-    return next((path for path in found if math.prod(image_size(list_images(path)[0])) <= LARGE_PICTURE), found[-1])
+    return next((path for path in found if math.prod(image_size(list_images(path)[0])) <= LARGE_IMAGE), found[-1])

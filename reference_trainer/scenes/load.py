@@ -18,7 +18,7 @@ from reference_trainer.scenes.dense import THIN, dense_start, made_unasked
 from reference_trainer.scenes.depth import point_prior, true_priors, with_prior
 from reference_trainer.scenes.formats import Capture, find_reader, only_default, register_format
 from reference_trainer.scenes.frames import Frame, corner_displacement, load_view
-from reference_trainer.scenes.images import LARGE_PICTURE, image_size, unreadable_photographs
+from reference_trainer.scenes.images import LARGE_IMAGE, image_size, unreadable_photographs
 from reference_trainer.scenes.numpy_formats import ARRAYS, IDR, LLFF
 from reference_trainer.scenes.options import BACKGROUNDS, SceneOptions
 from reference_trainer.scenes.points import check_no_leak, choose_points, filled, model_start
@@ -180,7 +180,7 @@ def _downscale(frames: list[Frame], asked: float | None) -> tuple[float, str]:
     if asked is not None:
         return asked, ""
     width, height = max((image_size(frame.path) for frame in frames), key=math.prod)
-    factor = math.sqrt(width * height / LARGE_PICTURE)
+    factor = math.sqrt(width * height / LARGE_IMAGE)
     if factor <= 1:
         return 1.0, ""
     return factor, (

@@ -15,7 +15,7 @@ from reference_trainer.camera import Camera
 from reference_trainer.npy_files import read_npy, read_npz
 from reference_trainer.scenes.formats import Capture, SceneFormat
 from reference_trainer.scenes.frames import Frame, view_matrix
-from reference_trainer.scenes.images import image_size, list_images, match_images, picture_folder
+from reference_trainer.scenes.images import image_folder, image_size, list_images, match_images
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud
 
@@ -62,14 +62,14 @@ def _llff_camera(row: NDArray[np.float64]) -> Camera:
 
 def _read_llff_scene(root: Path, options: SceneOptions) -> Capture:
     """Read a scene folder."""
-    return Capture(read_llff(root / "poses_bounds.npy", picture_folder(root, options.images)))
+    return Capture(read_llff(root / "poses_bounds.npy", image_folder(root, options.images)))
 
 
 LLFF = SceneFormat("llff", "poses_bounds.npy", lambda root: (root / "poses_bounds.npy").is_file(), _read_llff_scene)
 
 
 IDR_FILES = ("cameras_sphere.npz", "cameras.npz")
-DTU_PICTURES = (49, 64)
+DTU_IMAGES = (49, 64)
 
 
 def read_idr(path: str | Path, folder: str | Path) -> list[Frame]:
@@ -139,8 +139,8 @@ def _read_idr_scene(root: Path, options: SceneOptions) -> Capture:
     """Read a scene folder."""
     path = next((root / name for name in IDR_FILES if (root / name).is_file()), root / IDR_FILES[0])
     usual = "image" if (root / "image").is_dir() or not (root / "images").is_dir() else "images"
-    frames = read_idr(path, picture_folder(root, options.images, usual))
-    return Capture(frames, split="dtu" if len(frames) in DTU_PICTURES else "llff")
+    frames = read_idr(path, image_folder(root, options.images, usual))
+    return Capture(frames, split="dtu" if len(frames) in DTU_IMAGES else "llff")
 
 
 IDR = SceneFormat("idr", IDR_FILES[0], lambda root: any((root / name).is_file() for name in IDR_FILES), _read_idr_scene)
@@ -193,7 +193,7 @@ def read_arrays(path: str | Path, folder: str | Path) -> tuple[list[Frame], Poin
             f"{path}: poses must have shape (S, 3, 4) or (S, 4, 4) and intrinsics (S, 3, 3), got {poses.shape} and "
             f"{k.shape}."
         )
-    files, size, frames = _npz_pictures(path, folder, _first(arrays, NAMES), len(poses)), _map_size(arrays), []
+    files, size, frames = _npz_images(path, folder, _first(arrays, NAMES), len(poses)), _map_size(arrays), []
     to_camera = not arrays.keys().isdisjoint(TO_CAMERA)
     for file, pose, of in zip(files, poses, k, strict=True):
         axes, at = (pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]) if to_camera else (pose[:3, :3].T, pose[:3, 3])
@@ -211,7 +211,7 @@ def _first(arrays: Arrays, names: Sequence[str]) -> NDArray[Any] | None:
     return next((arrays[name] for name in names if name in arrays), None)
 
 
-def _npz_pictures(path: Path, folder: Path, names: NDArray[Any] | None, count: int) -> list[Path]:
+def _npz_images(path: Path, folder: Path, names: NDArray[Any] | None, count: int) -> list[Path]:
     """Return the image file of each camera."""
     if names is None:
         files = list_images(folder)
@@ -286,7 +286,7 @@ def _read_npz_scene(root: Path, options: SceneOptions) -> Capture:
     files = _npz_files(root)
     if len(files) != 1:
         raise ValueError(f"{root} must hold one .npz with the poses, got {[file.name for file in files]}.")
-    frames, points = read_arrays(files[0], picture_folder(root, options.images))
+    frames, points = read_arrays(files[0], image_folder(root, options.images))
     return Capture(sorted(frames, key=lambda frame: frame.name), points=points)
 
 

@@ -75,9 +75,9 @@ def collect_photographs(sources: Sequence[Path], folder: Path, frames: int = 16)
     names = []
     for path in sources:
         if is_video(path):
-            for number, picture in enumerate(sharpest_frames(path, frames)):
+            for number, image in enumerate(sharpest_frames(path, frames)):
                 names.append(f"{path.stem}_{number:04d}.jpg")
-                _save(picture, folder / names[-1])
+                _save(image, folder / names[-1])
         elif (turned := _upright(path)) is None:
             names.append(path.name)
             with replacing(folder / path.name) as place:
@@ -154,16 +154,16 @@ def _upright(path: Path) -> Any:
         except ImportError as error:
             raise ImportError(f"{path.name} needs pi-heif: pip install 'ca_reg[photos]'.") from error
         pi_heif.register_heif_opener()
-    with opened_image(path, ("HEIF",) if kind in HEIC else FORMATS) as picture:
-        if kind in _AS_THEY_ARE and picture.getexif().get(_ORIENTATION, 1) == 1:
+    with opened_image(path, ("HEIF",) if kind in HEIC else FORMATS) as image:
+        if kind in _AS_THEY_ARE and image.getexif().get(_ORIENTATION, 1) == 1:
             return None
-        return ImageOps.exif_transpose(picture.convert("RGB"))
+        return ImageOps.exif_transpose(image.convert("RGB"))
 
 
-def _save(picture: Any, path: Path) -> None:
+def _save(image: Any, path: Path) -> None:
     """Write a picture as JPEG, with its EXIF data."""
-    exif = picture.getexif()
+    exif = image.getexif()
     with suppress(KeyError):
         del exif[_ORIENTATION]
     with replacing(path) as place:
-        picture.save(place, "JPEG", quality=95, exif=exif)
+        image.save(place, "JPEG", quality=95, exif=exif)

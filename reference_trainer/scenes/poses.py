@@ -214,8 +214,8 @@ def _reconstruct(
         matching_options=pycolmap.FeatureMatchingOptions(num_threads=1),
     )  # fmt: skip
     pairs = len(photos) * (len(photos) - 1) // 2
-    _watched(extract, database, "keypoints", len(photos), desc="features", unit="photo", disable=not progress)
-    _watched(match, database, "two_view_geometries", pairs, desc="matching", unit="pair", disable=not progress)
+    _with_progress(extract, database, "keypoints", len(photos), desc="features", unit="photo", disable=not progress)
+    _with_progress(match, database, "two_view_geometries", pairs, desc="matching", unit="pair", disable=not progress)
     # One thread: with more, the order of summation, and so the result, would depend on their number.
     mapping = pycolmap.IncrementalPipelineOptions(min_model_size=2, num_threads=1, random_seed=seed)
     if few:
@@ -254,9 +254,9 @@ def enlarge(photos: list[Path], database: Path, folder: Path) -> dict[int, tuple
             folder.mkdir(exist_ok=True)
             camera = taken_with[photo.name]
             if camera.camera_id in sizes:
-                picture = decode_image(photo).convert("RGB")
-                picture = picture.resize((camera.width, camera.height), Resampling.LANCZOS)
-                picture.save(folder / photo.name, quality=100, subsampling=0)
+                resized = decode_image(photo).convert("RGB")
+                resized = resized.resize((camera.width, camera.height), Resampling.LANCZOS)
+                resized.save(folder / photo.name, quality=100, subsampling=0)
             else:
                 shutil.copy(photo, folder)
     return sizes
@@ -289,7 +289,7 @@ def _reduce(model: Any, sizes: Mapping[int, tuple[int, int]]) -> None:
     model.update_point_3d_errors()
 
 
-def _watched(job: Callable[..., None], database: Path, table: str, total: int, **bar: Any) -> None:
+def _with_progress(job: Callable[..., None], database: Path, table: str, total: int, **bar: Any) -> None:
     """Run a COLMAP job in another thread, with a progress bar over the rows it has written; Ctrl-C cancels it."""
     import pycolmap
 

@@ -38,7 +38,7 @@ DROP_RATE = 0.5
 THRESHOLD = 0.8  # of the expected alpha
 ROUNDS = 7  # how often everything but Monte Carlo is timed
 FIT_FROM = 8  # smallest K of the fitted lines: below, the error does not yet follow a power law in K
-PICTURE = 256  # side length of the picture of a PLY, pixels
+IMAGE_SIDE = 256  # pixels, of the image of a PLY
 
 
 def error_runtime_study(
@@ -71,7 +71,7 @@ def error_runtime_study(
         raise ValueError(f"sources must have different names, got {[str(source) for source in sources]}.")
     settings = {"max_samples": max_samples, "seeds": seeds, "device": device}
     cases = {name: {"source": source, **settings} for name, source in named.items()}
-    return Study("error_runtime", functools.partial(_measure, trust=tuple(trust)), cases, _report, _draw)
+    return Study("error_runtime", functools.partial(_measure, trust=tuple(trust)), cases, _report, _plot)
 
 
 def _measure(source: Path, max_samples: int, seeds: int, device: str, trust: Collection[str]) -> Record:
@@ -80,7 +80,7 @@ def _measure(source: Path, max_samples: int, seeds: int, device: str, trust: Col
     if is_ply(source):
         model, _ = load_plain_ply_model(source, device=device, trust=trust)
         means, opacities = model.gaussians.means, model.gaussians.opacities
-        (camera,) = orbit_views(means, opacities, count=1, width=PICTURE, height=PICTURE)
+        (camera,) = orbit_views(means, opacities, count=1, width=IMAGE_SIDE, height=IMAGE_SIDE)
         view = Viewpoint("orbit", camera)
     else:
         model, scene = load_run_model(source.parent, device, trust=trust)
@@ -94,12 +94,12 @@ def error_runtime(model: TrainedModel, view: Viewpoint, *, max_samples: int = 10
 
     - Monte Carlo with K = 2, 4, 8, ... up to ``max_samples`` renders, for so many ``seeds``: the unbiased variance
       (ddof = 1), accumulated in float64 in one running pass per seed. Its time includes drawing the masks.
-    - The paper's first-order form, and the exact moments in float32, drawn by every engine, and in float64.
+    - The paper's first-order form, and the exact moments in float32, rendered by every engine, and in float64.
 
     All share one region, the pixels whose expected alpha exceeds 0.8 in the exact float64 result. Times start from the
     parameters of the float32 model, so they include projection and tile lists; on a GPU the clock waits for the work to
     be done. Everything but Monte Carlo is called once untimed and then timed in turns with the plain render
-    (`in_turns`), which is drawn by the engine in use, as are the Monte Carlo renders.
+    (`in_turns`), which is rendered by the engine in use, as are the Monte Carlo renders.
 
     Returns:
         The exact float64 ``score``, the mean over RGB and the region, which covers the share ``covered`` of the pixels;
@@ -275,8 +275,8 @@ def _conclusion(record: Record, error: str) -> str:
     return f"{text}; continued as K^-0.5 it equals that of {name} at K = {needed:.1e}, after {hours:.1e} hours."
 
 
-def _draw(records: Records, figure: Any) -> None:
-    """Draw error against time, one panel per model; bars span the smallest to the largest error of a seed."""
+def _plot(records: Records, figure: Any) -> None:
+    """Plot error against time, one panel per model; bars span the smallest to the largest error of a seed."""
     figure.set_size_inches(WIDTH, 5.6)
     panels = figure.subplots(1, len(records), squeeze=False, sharey=True)[0]
     for axes, (name, record) in zip(panels, records.items(), strict=True):
@@ -288,7 +288,7 @@ def _draw(records: Records, figure: Any) -> None:
 
 
 def _panel(axes: Any, record: Record) -> None:
-    """Draw one model: filled markers for the score, hollow ones for the map."""
+    """Plot one model: filled markers for the score, hollow ones for the map."""
     styles = dict(zip((MONTE_CARLO, FIRST_ORDER, LOOPS, TORCH), zip("osD^", COLORS, strict=False), strict=True))
     for error in ERRORS:
         for name, (marker, color) in styles.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +24,8 @@ if TYPE_CHECKING:  # an extra
 
 __all__ = ["Clock", "Record", "Records", "Study", "checkpoints", "in_turns", "now", "run_study"]
 
-Say = Callable[[str], None]
+_log = logging.getLogger(__name__)
+
 Clock = Callable[[], float]
 """Returns seconds."""
 Record = dict[str, Any]
@@ -43,7 +45,7 @@ class Study:
         cases: the settings by name of the case: strings, numbers, None, paths of existing files, which count with size
             and modification time, and lists and dataclasses of these. A place to write to is a string.
         report: returns the tables of all records in Markdown.
-        draw: draws all records into an empty figure; None for no figure.
+        plot: plots all records in an empty figure; None for no figure.
         check: whether the study checks the program itself: once it is finished, the next call measures all again.
     """
 
@@ -51,12 +53,12 @@ class Study:
     measure: Callable[..., Record]
     cases: Mapping[str, Mapping[str, Any]]
     report: Callable[[Records], str]
-    draw: Callable[[Records, Figure], None] | None = None
+    plot: Callable[[Records, Figure], None] | None = None
     check: bool = False
 
 
-def run_study(study: Study, out: Path, *, executor: Executor | None = None, say: Say = print) -> Records:
-    """Measure the cases not measured yet; write all records, the tables and the figure, and print the tables.
+def run_study(study: Study, out: Path, *, executor: Executor | None = None) -> Records:
+    """Measure the cases not measured yet; write all records, the tables and the figure, and log the tables.
 
     Every record is on disk, in ``NAME.records.json``, as soon as its case is measured. Later calls reuse it as long as
     the settings, the files among them and the result of `machine` are the same; other cases may come and go.
@@ -65,7 +67,6 @@ def run_study(study: Study, out: Path, *, executor: Executor | None = None, say:
         study: the declaration.
         out: folder for the results.
         executor: where to measure, several cases at a time; None for this process, one after the other.
-        say: receives the progress and the tables.
 
     Returns:
         The records.
@@ -83,7 +84,7 @@ def run_study(study: Study, out: Path, *, executor: Executor | None = None, say:
         keys = {name: f"{name} {fingerprint([here, _decisive(dict(case))])}" for name, case in study.cases.items()}
         missing = [name for name, key in keys.items() if kept.get(key) is None]
         failed = {}
-        for name, outcome in _measured(study, missing, executor, say):
+        for name, outcome in _measured(study, missing, executor):
             if isinstance(outcome, Failure):
                 failed[name] = outcome.error
             else:
@@ -94,11 +95,11 @@ def run_study(study: Study, out: Path, *, executor: Executor | None = None, say:
         if records:
             text = study.report(records)
             write_text(out / f"{study.name}.md", text)
-            say(text)
-            if study.draw is not None:
+            _log.info("%s", text)
+            if study.plot is not None:
                 with new_figure(out / f"{study.name}.png") as figure:
-                    study.draw(records, figure)
-            say(f"numbers, tables and figures: {study.name}.* in {out}")
+                    study.plot(records, figure)
+            _log.info("numbers, tables and figures: %s.* in %s", study.name, out)
         if failed:
             why = "".join(f"\n  {name}: {error}" for name, error in failed.items())
             raise RuntimeError(f"{len(failed)} of {len(keys)} cases FAILED; the same command tries them again:{why}")
@@ -125,20 +126,18 @@ def checkpoints(runs: Sequence[Path]) -> dict[str, Path]:
     return {"/".join(folder.parts[-parts:]): folder / CHECKPOINT for folder in folders}
 
 
-def _measured(
-    study: Study, names: Sequence[str], executor: Executor | None, say: Say
-) -> Iterator[tuple[str, Record | Failure]]:
+def _measured(study: Study, names: Sequence[str], executor: Executor | None) -> Iterator[tuple[str, Record | Failure]]:
     """Measure cases; yield each when it is finished. Without an executor an error ends the study."""
     calls = {name: partial(study.measure, **study.cases[name]) for name in names}
     if executor is None:
         for number, (name, call) in enumerate(calls.items(), start=1):
-            say(f"[{number}/{len(names)}] {name}")
+            _log.info("[%d/%d] %s", number, len(names), name)
             yield name, call()
         return
     tasks = [Task(name, call, ()) for name, call in calls.items()]
     for number, (index, outcome) in enumerate(run_all(executor, tasks), start=1):
         failed = isinstance(outcome, Failure)
-        say(f"[{number}/{len(names)}] {names[index]}{': FAILED' if failed else ''}")
+        _log.info("[%d/%d] %s%s", number, len(names), names[index], ": FAILED" * failed)
         yield names[index], outcome if isinstance(outcome, Failure) else outcome.value
 
 

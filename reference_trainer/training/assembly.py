@@ -51,7 +51,7 @@ def check(config: TrainConfig) -> None:
     for what, needs in ((config.density, density.needs), ("the loss", of_terms)):
         if lacking := ", ".join(sorted(needs - renderer.capabilities - {"models"})):
             raise ValueError(f"{what} needs {lacking}, which the renderer {config.renderer} lacks.")
-    if config.analytic and (drawn := [type(term).__name__ for term in terms if not term.analytic]):
+    if config.analytic and (sampled := [type(term).__name__ for term in terms if not term.analytic]):
         raise ValueError(
-            f"analytic training has no draw, which {', '.join(drawn)} needs: leave out analytic, or the term."
+            f"analytic training has no draw, which {', '.join(sampled)} needs: leave out analytic, or the term."
         )

@@ -34,8 +34,8 @@ class Plan:
 
     def applied(self, config: TrainConfig, *, given: Collection[str] = ()) -> TrainConfig:
         """Return the settings with the changes of all items, except to fields that are ``given`` or not at default."""
-        kept = _kept(config, given)
-        changes = {name: value for item in self.items for name, value in item.changes.items() if name not in kept}
+        fixed = _fixed(config, given)
+        changes = {name: value for item in self.items for name, value in item.changes.items() if name not in fixed}
         return dataclasses.replace(config, **changes)
 
     def as_dict(self) -> dict[str, Any]:
@@ -99,20 +99,20 @@ def make_plan(
     if unknown := set(given) - {f.name for f in dataclasses.fields(TrainConfig)}:
         raise ValueError(f"given must name fields of TrainConfig, got {sorted(unknown)}.")
     check(config)
-    kept = _kept(config, given)
+    fixed = _fixed(config, given)
     rules = (partial(rule, device=device) if rule is unseen else rule for rule in RULES)  # the one that renders
-    return Plan(tuple(_item(rule(scene, config), config, kept) for rule in rules))
+    return Plan(tuple(_item(rule(scene, config), config, fixed) for rule in rules))
 
 
-def _kept(config: TrainConfig, given: Collection[str]) -> set[str]:
+def _fixed(config: TrainConfig, given: Collection[str]) -> set[str]:
     """Fields that the plan must not touch."""
     # A value at its default may have been asked for: `given` tells, the value cannot.
     default = vars(TrainConfig())
     return {*given, *(name for name, value in vars(config).items() if value != default[name])}
 
 
-def _item(found: PlanItem, config: TrainConfig, kept: Collection[str]) -> PlanItem:
+def _item(found: PlanItem, config: TrainConfig, fixed: Collection[str]) -> PlanItem:
     """Turn what a rule has found into a decision: what the user asked for stays."""
-    chosen = ", ".join(f"{name}={getattr(config, name)}" for name in found.changes if name in kept)
+    chosen = ", ".join(f"{name}={getattr(config, name)}" for name in found.changes if name in fixed)
     reason = f"asked for ({chosen}); the plan alone: {found.reason}"
     return PlanItem(found.name, "used", reason) if chosen else found

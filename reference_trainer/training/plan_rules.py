@@ -79,7 +79,7 @@ def background(scene: Scene, config: TrainConfig) -> PlanItem:
 
 
 def depth_output(scene: Scene, config: TrainConfig) -> PlanItem:
-    """Depth is drawn only if a term of the loss needs it."""
+    """Depth is rendered only if a term of the loss needs it."""
     if asking := _terms_that_need("depth", config):
         return PlanItem("depth output", "used", f"asked for: {asking} looks at it")
     return PlanItem("depth output", "left out", "by construction: no term of the loss looks at depth")

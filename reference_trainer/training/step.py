@@ -58,7 +58,7 @@ class Step:
         background: color behind the model, shape (3,).
         sh_degree: highest band of spherical harmonics of this step.
         seed: of the training.
-        renderer: what draws.
+        renderer: what renders.
         absgrad: whether density control is to see absolute gradients.
         label: prefix of the labels of the random streams.
         siblings: the steps of all models at this view, this one among them, the first model's first.
@@ -110,14 +110,14 @@ class Step:
 
     def expect(self) -> None:
         """Render the view in expectation over the draws of the regularizer."""
-        multiplied = self.regularizer.alpha_factor(self.params)
-        assert multiplied is not None, "the trainer has refused this"
-        self.rendered, multiplier = multiplied
+        factored = self.regularizer.alpha_factor(self.params)
+        assert factored is not None, "the trainer has refused this"
+        self.rendered, multiplier = factored
         moments = self.moments(self.view.camera, multiplier, self.rendered, observed=True)
         self.image, self.variance = moments.mean, moments.variance
 
     def at(self, view: View) -> Step:
-        """Return the step at another training view, drawn as this one was but with random numbers of its own.
+        """Return the step at another training view, rendered as this one was but with random numbers of its own.
 
         Density control counts it as it counts the view of the step.
         """

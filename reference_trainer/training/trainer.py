@@ -47,7 +47,7 @@ class Trainer:
         seconds: wall-clock time that they took.
         processor_seconds: CPU time that all threads spent on them: the fairer figure on a busy machine.
         loss: of the last step, of all models together; nan before the first.
-        renderer: what draws all but moments.
+        renderer: what renders all but moments.
         models: what is trained; the first is the one that is measured and written.
         optimizer: of the first model.
         density: likewise.
@@ -57,8 +57,8 @@ class Trainer:
     Raises:
         ValueError: if the photographs lack what a term of the loss compares with, or show a background where it is to
             be random, or the training is to be analytic and a regularizer has no exact expectation.
-        ImportError: if gsplat is to draw, and is missing.
-        RuntimeError: if gsplat is to draw on something else than a CUDA device.
+        ImportError: if gsplat is to render, and is missing.
+        RuntimeError: if gsplat is to render on something else than a CUDA device.
 
     Example:
         >>> from reference_trainer.scenes import synthetic_scene
@@ -192,7 +192,7 @@ class Trainer:
         if loss.requires_grad:
             for model, step in zip(self.models, steps, strict=True):
                 for splats, camera in step.observed if model.density.observes(self.step) else ():
-                    if splats.means.grad is not None:  # none if nothing was drawn, or no term saw it
+                    if splats.means.grad is not None:  # none if nothing was rendered, or no term saw it
                         model.density.observe(splats, camera)
                 model.optimizer.set_means_rate(self.config.means_rate_at(self.step) * self._extent)
                 model.optimizer.step()

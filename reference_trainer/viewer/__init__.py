@@ -1,1 +1,1 @@
-"""Interactive viewing of a model in a browser, drawn by this package's renderer; ``window.py`` needs viser."""
+"""Interactive viewing of a model in a browser, rendered by this package; ``window.py`` needs viser."""

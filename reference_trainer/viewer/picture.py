@@ -25,7 +25,7 @@ from reference_trainer.evaluation.shares import PER_WEIGHT_SCALE, Heat, colored_
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.scenes.scene import View, Viewpoint
 
-__all__ = ["DisplayOptions", "Mode", "Picture", "ViewerModel", "with_photograph"]
+__all__ = ["Display", "DisplayOptions", "Mode", "ViewerModel", "with_photograph"]
 
 Mode = Literal["render", "co-adaptation", "expected error", "support", "depth", "heat"]
 
@@ -46,8 +46,8 @@ class DisplayOptions:
     hidden: float = 0.0  # fraction of the Gaussians to leave out, those of highest heat first, in [0, 1)
 
 
-class Picture(NamedTuple):
-    """A picture (3, H, W) in [0, 1], a note on it, and what its color bar means: low end, high end, quantity."""
+class Display(NamedTuple):
+    """An image (3, H, W) in [0, 1], a note on it, and what its color bar means: low end, high end, quantity."""
 
     image: Tensor
     note: str
@@ -66,8 +66,8 @@ class ViewerModel:
         >>> gaussians = Gaussians.from_points(torch.rand(9, 3), torch.rand(9, 3), torch.full((9,), 0.1), sh_degree=1)
         >>> camera = Camera(torch.eye(4), 20.0, 20.0, 8.0, 8.0, 16, 16)
         >>> shown = ViewerModel(TrainedModel(gaussians, torch.zeros(3)), [])
-        >>> picture = shown.render(DisplayOptions("co-adaptation"), camera)
-        >>> picture.image.shape, picture.scale[:2]
+        >>> display = shown.render(DisplayOptions("co-adaptation"), camera)
+        >>> display.image.shape, display.scale[:2]
         (torch.Size([3, 16, 16]), ('0', '0.02'))
     """
 
@@ -95,8 +95,8 @@ class ViewerModel:
         return ErrorMaps(self.model, self.train)
 
     @torch.no_grad()
-    def render(self, options: DisplayOptions, camera: Camera) -> Picture:
-        """Draw the model.
+    def render(self, options: DisplayOptions, camera: Camera) -> Display:
+        """Render the model.
 
         Raises ValueError if heat is needed (for its colors or to hide Gaussians) and cannot be measured, see `heat`; or
         support without photographs.
@@ -104,16 +104,16 @@ class ViewerModel:
         if options != self._chosen_last[0]:
             self._chosen_last = options, self._chosen(options)
         model, view = self._chosen_last[1], Viewpoint("", camera.to(self.model.gaussians.means.device))
-        draw = {
+        renders = {
             "co-adaptation": self._co_adaptation,
             "expected error": self._expected_error,
             "support": self._support,
             "depth": self._depth,
         }
-        return draw.get(options.mode, self._render)(options, model, view)
+        return renders.get(options.mode, self._render)(options, model, view)
 
-    def _render(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
-        """Draw the colors of a model, which those of its heat may have replaced."""
+    def _render(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Display:
+        """Render the colors of a model, which those of its heat may have replaced."""
         image, note, scale = model.test_rendering(view).image.clamp(0, 1), "", None
         if options.mode == "heat":
             low, high = PER_WEIGHT_SCALE
@@ -122,10 +122,10 @@ class ViewerModel:
             shares = self.heat.shares
             hidden = shares[self.heat.ranks >= 1 - options.hidden].sum() / shares.sum()
             note = f"{hidden:.0%} of the exact CA are hidden"
-        return Picture(image, note, scale)
+        return Display(image, note, scale)
 
-    def _co_adaptation(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
-        """Draw the exact variance of every pixel."""
+    def _co_adaptation(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Display:
+        """Render the exact variance of every pixel."""
         result = CAScore.exact(model.moments, regularizer=_draws(options))(model.gaussians.opacities, view)
         rate, noise = options.drop_rate, options.noise
         of = f" at drop rate {rate:g}" * (rate != 0.5) + f" with noise {noise:g}" * (noise > 0)
@@ -134,35 +134,35 @@ class ViewerModel:
         if not bool(result.visible.all()):
             note += f", {1 - result.visible.double().mean().item():.0%} of the picture not covered"
             scale += "; gray, not covered: when Gaussians are left out, more than a fifth is background on average"
-        return Picture(ca_picture(result), note, ("0", f"{CA_PICTURE_RANGE:g}", scale))
+        return Display(ca_picture(result), note, ("0", f"{CA_PICTURE_RANGE:g}", scale))
 
-    def _expected_error(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
-        """Draw the expected error of the whole model: hidden and masked Gaussians count."""
+    def _expected_error(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Display:
+        """Render the expected error of the whole model: hidden and masked Gaussians count."""
         found = self.error_maps(view)
         low, high = found.interval
         scale = "0", f"{ERROR_PICTURE_RANGE:g}", "expected absolute error of the color"
-        return Picture(expected_error_picture(found), f"expected {found.psnr:.1f} dB, {low:.1f} to {high:.1f}", scale)
+        return Display(expected_error_picture(found), f"expected {found.psnr:.1f} dB, {low:.1f} to {high:.1f}", scale)
 
-    def _support(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
-        """Draw how many training photographs show the surface of the whole model, as `_expected_error` does."""
+    def _support(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Display:
+        """Render how many training photographs show the surface of the whole model, as `_expected_error` does."""
         if not self.train:
             raise ValueError("the support is told by the training photographs, of which there are none: give --scene.")
         most, support = min(len(self.train), NEAREST), self.error_maps.support(view)
         none, one = ((support == count).double().mean().item() for count in (0, 1))
         scale = "0", f"{most}", "photographs that show it, by the model's depth; gray: nothing covers half of the pixel"
-        return Picture(heat_map(support, most), f"shown by no photograph {none:.0%}, by one {one:.0%}", scale)
+        return Display(heat_map(support, most), f"shown by no photograph {none:.0%}, by one {one:.0%}", scale)
 
-    def _depth(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Picture:
-        """Draw the nearness of what covers half of a pixel at least."""
+    def _depth(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Display:
+        """Render the nearness of what covers half of a pixel at least."""
         out = model.test_rendering(view, depth=True)
         assert out.depth is not None
         nearness = torch.where(out.alpha > 0.5, out.alpha / out.depth, torch.nan)
         if not (seen := nearness[nearness.isfinite()]).numel():
-            return Picture(torch.full_like(out.image, 0.5), "nothing covers half of a pixel")
+            return Display(torch.full_like(out.image, 0.5), "nothing covers half of a pixel")
         low, high = seen[:: 1 + len(seen) // 10_000].quantile(seen.new_tensor([0.02, 0.98])).tolist()
         colors = heat_colors(nearness.flatten(), low, max(high, low * 1.001))
         scale = f"{1 / low:.3g}", f"{1 / high:.3g}", "depth; gray: nothing covers half of the pixel"
-        return Picture(colors.T.view_as(out.image), "", scale)
+        return Display(colors.T.view_as(out.image), "", scale)
 
     def _chosen(self, options: DisplayOptions) -> TrainedModel:
         """Return the model with the Gaussians, colors and opacities of some options."""

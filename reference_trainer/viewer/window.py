@@ -30,13 +30,13 @@ from reference_trainer.scenes.scene import View, Viewpoint
 from reference_trainer.scenes.virtual_cameras import interpolate_cameras, measured_views
 from reference_trainer.threads import threads_for
 from reference_trainer.training.trainer import Trainer
-from reference_trainer.viewer.picture import DisplayOptions, Mode, Picture, ViewerModel, with_photograph
+from reference_trainer.viewer.picture import Display, DisplayOptions, Mode, ViewerModel, with_photograph
 
 __all__ = ["Viewer"]
 
 HOST = "127.0.0.1"
 STILL = 0.2
-"""Seconds without a change after which a picture is drawn at full resolution."""
+"""Seconds without a change after which a picture is rendered at full resolution."""
 ROUGH_SECONDS = 0.1
 """Target time of a picture while the camera moves; the resolution adapts to it."""
 FEWEST, MOST = 10_000, 1_000_000
@@ -63,8 +63,8 @@ class _Window:
 class Viewer(contextlib.AbstractContextManager["Viewer", None]):
     """A context manager that serves pages on this machine which show a model, or two with one camera.
 
-    Everything is drawn in the thread that calls `serve` or `follow`: a training is drawn between its steps. It listens
-    at ``port``; 0 for any free one.
+    Everything is rendered in the thread that calls `serve` or `follow`: a training is rendered between its steps. It
+    listens at ``port``; 0 for any free one.
 
     Raises:
         ImportError: if viser is missing.
@@ -89,7 +89,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         self._models: dict[str, ViewerModel] = {}
         self._chosen: Any = None  # of several models
         self._photographs: list[View] = []
-        self._frusta: list[tuple[Any, Any]] = []  # position, and what viser draws there
+        self._frusta: list[tuple[Any, Any]] = []  # position, and what viser shows there
         self._windows: dict[int, _Window] = {}
         self._changed = threading.Event()
         self._rough_pixels, self._next_model = 40_000, 0.0
@@ -128,7 +128,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         self._moved(still=True)
 
     def serve(self) -> None:
-        """Draw whatever pages need until Ctrl-C."""
+        """Render whatever pages need until Ctrl-C."""
         with contextlib.suppress(KeyboardInterrupt):
             while True:
                 wait = self.update()
@@ -136,7 +136,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
                 self._changed.clear()
 
     def follow(self, trainer: Trainer) -> None:
-        """Draw the model of a training between two of its steps; does nothing while no page is open."""
+        """Render the model of a training between two of its steps; does nothing while no page is open."""
         if not self._windows:
             return
         start = time.perf_counter()
@@ -167,56 +167,56 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         return min(waits, default=None)
 
     def _send(self, window: _Window) -> None:
-        """Draw one picture and send it to a page."""
+        """Render one picture and send it to a page."""
         view = window.client.camera
         if not self._models:
             return
         start = time.perf_counter()
         camera = _camera(view, self._rough_pixels if window.rough else MOST)
-        pictures = self._draw(camera)
+        displays = self._render(camera)
         if window.client.client_id not in self._windows:  # closed in the meantime
             return
-        image = torch.cat([picture.image.cpu() for picture in pictures.values()], 2)
+        image = torch.cat([display.image.cpu() for display in displays.values()], 2)
         window.client.scene.set_background_image(np.asarray(as_pillow(image)), format="jpeg", jpeg_quality=90)
-        self._hide_nearest_frustum(view.position, beside=len(pictures) > 1)
+        self._hide_nearest_frustum(view.position, beside=len(displays) > 1)
         took = max(1e-3, time.perf_counter() - start)
         if window.rough:
             pixels = self._rough_pixels * min(2.0, max(0.5, ROUGH_SECONDS / took))
             self._rough_pixels = int(min(MOST, max(FEWEST, pixels)))
         else:
             notes = []
-            for name, picture in pictures.items():
+            for name, display in displays.items():
                 model, title = self._models[name].model, f"**{name}** " * (len(self._models) > 1)
                 notes.append(f"{title}step {model.step:,}: {len(model.gaussians):,} Gaussians")
-                notes += [picture.note] * bool(picture.note)
+                notes += [display.note] * bool(display.note)
             self._status.content = "\n\n".join([*notes, f"{camera.width}x{camera.height} in {took * 1e3:.0f} ms"])
-            if self._bar.visible != (picture.scale is not None):
-                self._bar.visible = picture.scale is not None
-            if picture.scale is not None:
-                self._bar.image = np.asarray(as_pillow(color_bar(*picture.scale[:2], width=320)))
-                self._bar.label = picture.scale[2]
+            if self._bar.visible != (display.scale is not None):
+                self._bar.visible = display.scale is not None
+            if display.scale is not None:
+                self._bar.image = np.asarray(as_pillow(color_bar(*display.scale[:2], width=320)))
+                self._bar.label = display.scale[2]
 
-    def _draw(self, camera: Camera) -> dict[str, Picture]:
+    def _render(self, camera: Camera) -> dict[str, Display]:
         """Return the picture of every model that is chosen, by name; two share the width of the camera."""
         one = None if self._chosen is None or self._chosen.value == BOTH else self._chosen.value
         names = list(self._models) if one is None else [one]
-        width, pictures = max(1, camera.width // len(names)), dict[str, Picture]()
+        width, displays = max(1, camera.width // len(names)), dict[str, Display]()
         camera = replace(camera, width=width, cx=camera.cx - (camera.width - width) / 2)
         with threads_for(len(names) * width * camera.height):
             for name in names:
                 shown = self._models[name]
                 try:
-                    picture = shown.render(self._options, camera)
+                    display = shown.render(self._options, camera)
                 except ValueError as error:
-                    picture = shown.render(DisplayOptions(), camera)._replace(note=str(error))
+                    display = shown.render(DisplayOptions(), camera)._replace(note=str(error))
                 if share := self._photograph.value / 100:
                     if (view := self._photograph_at(camera)) is None:
-                        notes = filter(None, (picture.note, "no photograph from here: go to a camera"))
-                        picture = picture._replace(note="; ".join(notes))
+                        notes = filter(None, (display.note, "no photograph from here: go to a camera"))
+                        display = display._replace(note="; ".join(notes))
                     else:
-                        picture = picture._replace(image=with_photograph(picture.image, camera, view, share))
-                pictures[name] = picture
-        return pictures
+                        display = display._replace(image=with_photograph(display.image, camera, view, share))
+                displays[name] = display
+        return displays
 
     def _photograph_at(self, camera: Camera) -> View | None:
         """Return the photograph that was taken where a camera stands, None if there is none."""
@@ -224,7 +224,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         return next(near, None)
 
     def _save(self, window: _Window, wish: str) -> None:
-        """Draw what a page asked for at full resolution, with titles and color bars, and let it download the file."""
+        """Render what a page asked for at full resolution, with titles and color bars, and let it download the file."""
         if wish == "screenshot":
             file = io.BytesIO()
             as_pillow(self._sheet(_camera(window.client.camera, MOST))).save(file, "PNG")
@@ -243,11 +243,11 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
 
     def _sheet(self, camera: Camera, *, notes: bool = True) -> torch.Tensor:
         """Return what a page shows, (3, H, W), with the names of the models, color bars, and the notes on it."""
-        pictures, mode = self._draw(camera), self._options.mode
+        displays, mode = self._render(camera), self._options.mode
         return side_by_side(
-            [picture.image for picture in pictures.values()],
-            [", ".join(filter(None, (name, mode, of.note * notes))) for name, of in pictures.items()],
-            scales=[picture.scale and picture.scale[:2] for picture in pictures.values()],
+            [display.image for display in displays.values()],
+            [", ".join(filter(None, (name, mode, of.note * notes))) for name, of in displays.items()],
+            scales=[display.scale and display.scale[:2] for display in displays.values()],
         )
 
     @property
@@ -281,7 +281,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         self._buttons.on_click(lambda event: self._ask(event.client, self._buttons.value))
 
     def _ask(self, client: Any, wish: str) -> None:
-        """Note what a page asks for; it is drawn by the thread that draws everything."""
+        """Note what a page asks for; it is rendered by the thread that renders everything."""
         window = self._windows.get(client.client_id) if client is not None else None
         if window is None:
             return

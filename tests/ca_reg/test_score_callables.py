@@ -88,10 +88,10 @@ def test_a_reused_output_buffer_changes_nothing(method, dtype):
 def test_an_alpha_pass_may_fill_the_buffer_of_the_image(method, numpy):
     write = into(torch.empty(3, HEIGHT, WIDTH, dtype=torch.float64))
 
-    def drawn(values):
+    def rendered(values):
         return lambda opacity, view: (lambda x: x.numpy() if numpy else x)(write(blend(opacity, values)))
 
-    score = method(drawn(COLORS), alpha_fn=drawn(torch.ones_like(COLORS)), **SETTINGS)
+    score = method(rendered(COLORS), alpha_fn=rendered(torch.ones_like(COLORS)), **SETTINGS)
     same(score(OPACITY, None), method(render, **SETTINGS)(OPACITY, None))
 
 

@@ -178,8 +178,8 @@ def test_composed_noise_and_dropout_with_a_generator_leave_the_global_one_alone(
         images.append(image)
     assert torch.equal(*images)
     noise, dropout = regularizer
-    undrawn = ~dropout.keep | (noise.noise <= -1)  # the clamp at 0 drops as well
-    assert not info["radii"][:, undrawn].any()
+    dropped = ~dropout.keep | (noise.noise <= -1)  # the clamp at 0 drops as well
+    assert not info["radii"][:, dropped].any()
     opacities = apply_dropout((params["opacities"].sigmoid() * (1 + noise.noise)).clamp(0, 1), dropout.keep)
     expected = rasterization(**activated(params) | {"opacities": opacities}, **cameras)[0]
     torch.testing.assert_close(images[0], expected, rtol=0, atol=1e-6)
@@ -197,7 +197,7 @@ def test_nothing_to_do_passes_the_very_same_tensor(params):
     assert seen[0] is opacities
 
 
-def test_batches_are_drawn_as_one_set():
+def test_batches_are_rendered_as_one_set():
     def stand_in(means, quats, scales, opacities, colors, viewmats, Ks, width, height, packed=True):
         batches, n = opacities.shape
         info = {"radii": torch.ones(batches, 3, n, 2, dtype=torch.int32), "gaussian_ids": None}
@@ -255,7 +255,7 @@ def test_mistakes_are_told(monkeypatch):
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("packed", [True, False])
-def test_gsplat_itself_draws_and_counts_as_without_the_dropped_gaussians(packed, params, cameras):
+def test_gsplat_itself_renders_and_counts_as_without_the_dropped_gaussians(packed, params, cameras):
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     gsplat = pytest.importorskip("gsplat", exc_type=ImportError)

@@ -179,7 +179,7 @@ def test_a_cpu_is_refused():
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_gsplats_kernels_list_what_they_draw(antialiased):
+def test_gsplats_kernels_list_what_they_render(antialiased):
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     pytest.importorskip("gsplat", exc_type=ImportError)

@@ -44,7 +44,7 @@ def densify(model, optimizer):
 
 
 def computed_means(model):
-    """Positions of a deformed field."""
+    """Positions of a deformed model."""
     return {"means3D": model.get_xyz + 0.0 * model.get_scaling}
 
 
@@ -102,7 +102,7 @@ def test_the_parameters_tell_the_steps(rasterizer, model_class, deformed, every)
     assert all(not torch.equal(a, b) for i, a in enumerate(masks[2:]) for b in masks[2:][:i])
 
 
-def test_two_fields_with_computed_positions_are_two(rasterizer):
+def test_two_models_with_computed_positions_are_two(rasterizer):
     models, render = [Model(seed=0), Model(seed=0)], make_render(rasterizer)
     with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer) as hook:
         hook.step(1)

@@ -76,7 +76,7 @@ def train_step(model, optimizers, camera, step):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_the_real_model_trains_and_counts_only_what_was_drawn(splatfacto):
+def test_the_real_model_trains_and_counts_only_what_was_rendered(splatfacto):
     model, optimizers, camera = make_real(splatfacto, nerfstudio.SplatfactoCAModelConfig(dropout=0.4))
     assert isinstance(model, splatfacto.SplatfactoModel)
     before = model.means.detach().clone()

@@ -13,7 +13,7 @@ import torch
 from oracles import random_scene
 from stand_ins.gsplat import intrinsics, rasterization
 
-from ca_reg.integrations._scripts import Watch, in_children
+from ca_reg.integrations._scripts import ScriptAudit, in_children
 from ca_reg.integrations.run import main
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path), "OMP_NUM_THREADS": "1"}
@@ -101,12 +101,12 @@ def test_a_process_that_trains_past_the_hook_fails_the_run(repository):
     ],
 )
 def test_a_process_that_cannot_be_hooked_is_named(command, changes, named):
-    with in_children("json:dumps", {}), Watch() as watch:
+    with in_children("json:dumps", {}), ScriptAudit() as audit:
         subprocess.run(
             [sys.executable, *command], env={**os.environ, **changes}, check=False, stdout=subprocess.DEVNULL
         )
         subprocess.run(["true"], check=True)
-    assert watch.missed == ([" ".join([sys.executable, *command])] if named else [])
+    assert audit.missed == ([" ".join([sys.executable, *command])] if named else [])
 
 
 def test_a_sitecustomize_of_ones_own_still_runs(tmp_path, monkeypatch):

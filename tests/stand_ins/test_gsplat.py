@@ -1,4 +1,4 @@
-"""The stand-in for gsplat has the signature of the package; what it draws is tested in compat/test_rasterization.py."""
+"""The stand-in for gsplat has the signature of the package; what it renders, compat/test_rasterization.py tests."""
 
 import inspect
 

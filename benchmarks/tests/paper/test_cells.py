@@ -16,7 +16,7 @@ from benchmarks.paper import cells as cells_module
 from benchmarks.paper.__main__ import main
 from benchmarks.paper.cells import Grid, declared, depths, is_done, renders, rows_of, run_cells
 from benchmarks.paper.claims import CLAIMS, chosen
-from benchmarks.paper.comparison import Kept, judged
+from benchmarks.paper.comparison import RowStore, judged
 from benchmarks.paper.rows import Rows, config_of, resolved, value
 from benchmarks.paper.scenes import PAPER_SIZE, SCENES, chosen_scenes
 from ca_reg.regularizers import REGULARIZERS
@@ -232,7 +232,7 @@ def test_two_claims_on_the_built_in_scene(tmp_path, monkeypatch, capsys):
     assert all(len(json.dumps(each)) < 1_500 for each in rows)
     assert all(0 < value(each, "depth abs_rel") < 2 and list(each["path"]) == list("123456") for each in rows)
     assert [math.isfinite(value(each, "renders five")) for each in rows] == [False, True, False] * 2
-    kept = Kept(tmp_path / "rows", "3dgs", 20)
+    kept = RowStore(tmp_path / "rows", "3dgs", 20)
     assert judged(CLAIMS["9"], kept).keys() == judged(CLAIMS["14"], kept).keys() == {"synthetic"}
     nothing = Here()
     run_cells(grid, Running(nothing))

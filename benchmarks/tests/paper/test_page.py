@@ -14,7 +14,7 @@ from benchmarks.choices import BY_DEFAULT, pairs_of
 from benchmarks.paper import figure as figure_module
 from benchmarks.paper.cells import Grid, declared, estimate, is_done, rows_of
 from benchmarks.paper.claims import CLAIMS, Check, Claim, chosen
-from benchmarks.paper.comparison import Kept, differences, judged
+from benchmarks.paper.comparison import RowStore, differences, judged
 from benchmarks.paper.figure import gains_figure, ranking_figure
 from benchmarks.paper.page import claims_table, details, gains, page, scenes_table
 from benchmarks.paper.rows import Rows, resolved, value
@@ -79,7 +79,7 @@ def test_what_is_kept_of_other_photographs_is_not_taken_for_these(tmp_path):
 
 
 @pytest.fixture
-def kept(tmp_path):
+def store(tmp_path):
     """Dropout helps on one scene, harms on another, and there is one seed of the third."""
     figures = {"a": [(20.0, 21.0), (20.2, 21.1), (19.9, 21.0)], "b": [(20.0, 19.0), (20.2, 19.1)], "c": [(20.0, 20.5)]}
     for scene, pairs in figures.items():
@@ -87,30 +87,30 @@ def kept(tmp_path):
         for seed, (plain, dropout) in enumerate(pairs):
             rows.add(row(plain, seed))
             rows.add(row(dropout, seed, ca=2e-3, regularizer="dropout(0.2)"))
-    return Kept(tmp_path)
+    return RowStore(tmp_path)
 
 
-def test_claims_are_judged_scene_by_scene(kept):
-    assert judged(CLAIMS["1"], kept) == {"a": (3, "holds"), "b": (2, "fails"), "c": (1, "undecided")}
-    assert judged(CLAIMS["2"], kept) == {}
-    lines = {line.split(" | ")[0].strip("| "): line for line in claims_table(kept).splitlines()[2:]}
+def test_claims_are_judged_scene_by_scene(store):
+    assert judged(CLAIMS["1"], store) == {"a": (3, "holds"), "b": (2, "fails"), "c": (1, "undecided")}
+    assert judged(CLAIMS["2"], store) == {}
+    lines = {line.split(" | ")[0].strip("| "): line for line in claims_table(store).splitlines()[2:]}
     assert lines["1"].endswith("| depends on the scene | holds: a (3); fails: b (2); undecided: c (1) |")
     assert lines["2"].endswith("| not yet measured | - |")
     assert "systems" not in lines
 
 
-def test_gains_are_in_the_order_of_their_mean_and_those_that_lack_a_scene_are_last(kept):
-    for seed, of in kept.scenes["a"].of(resolved({}, "3dgs", 3_000)).items():
-        kept.scenes["a"].add(row(of["test"]["psnr"] + 7.0, seed, regularizer="dropout(0.3)"))
+def test_gains_are_in_the_order_of_their_mean_and_those_that_lack_a_scene_are_last(store):
+    for seed, of in store.scenes["a"].of(resolved({}, "3dgs", 3_000)).items():
+        store.scenes["a"].add(row(of["test"]["psnr"] + 7.0, seed, regularizer="dropout(0.3)"))
         for name, gain in (("a", 1.5), ("b", 0.5)):
-            kept.scenes[name].add(row(20.0 + gain, seed, ca=4e-3, regularizer="dropout(0.1)"))
-    lines = gains("7", Kept(kept.folder)).splitlines()
+            store.scenes[name].add(row(20.0 + gain, seed, ca=4e-3, regularizer="dropout(0.1)"))
+    lines = gains("7", RowStore(store.folder)).splitlines()
     assert lines[0] == "| setting | mean | a | b |"  # of c there is one seed
     assert [line.split(" | ")[0] for line in lines[2:]] == ["| `dropout(0.1)`", "| `dropout(0.2)`", "| `dropout(0.3)`"]
     # 1.0, 0.9, 1.1 and -1.0, -1.1: their means, and two standard errors
     assert lines[3] == "| `dropout(0.2)` | -0.02 dB | +1.00 ± 0.12 dB | -1.05 ± 0.10 dB |"
     assert lines[4].endswith("| +7.00 dB | +7.00 ± 0.00 dB | n/a |")
-    assert gains("11", Kept(kept.folder)) == ""
+    assert gains("11", RowStore(store.folder)) == ""
 
 
 def test_the_table_of_scenes_pools_what_seeds_differ_by_over_settings_and_pairs(tmp_path):
@@ -121,61 +121,61 @@ def test_the_table_of_scenes_pools_what_seeds_differ_by_over_settings_and_pairs(
             rows.add(row(found, seed, regularizer=name))
     rows.add(row(99.0, regularizer="density"))  # of one seed nothing is known
     Rows(tmp_path / "b.json").add(row(20.0))
-    lines = scenes_table(Kept(tmp_path)).splitlines()
+    lines = scenes_table(RowStore(tmp_path)).splitlines()
     one, two = math.sqrt(6 / 3), math.sqrt(2 / 3)
     assert lines[2] == f"| a | 10 | 0.2 | {one:.2f} dB | {two:.2f} dB | {math.ceil(400 * 2 / 3)} |"
     assert lines[3] == "| b | 1 | 0.0 | n/a | n/a | n/a |"
 
 
-def test_details_show_what_is_measured_and_every_check(kept):
-    text = details("1", kept)
+def test_details_show_what_is_measured_and_every_check(store):
+    text = details("1", store)
     assert "| plain | 3 | 20.03 ± 0.15 | 5 ± 0 | 1 ± 0 |" in text  # no SSIM, which no row has, no seconds
     assert "- `dropout(0.2) - plain`, PSNR: +1 ± 0.12 (claimed: above 0), holds" in text
     assert "- `dropout(0.2) - plain`, CA: -3 ± 0 (claimed: below 0), holds" in text
     assert "PSNR: +0.5 (claimed: above 0), undecided" in text
-    assert details("9", kept).count("renders") == 0
-    assert details("16", kept) == details("1", Kept(kept.folder, "inria")) == ""
+    assert details("9", store).count("renders") == 0
+    assert details("16", store) == details("1", RowStore(store.folder, "inria")) == ""
 
 
-def test_a_declared_scene_counts_only_where_a_claim_names_it(kept, monkeypatch):
+def test_a_declared_scene_counts_only_where_a_claim_names_it(store, monkeypatch):
     for name in ("fern", "lego"):
-        (kept.folder / f"{name}.json").write_text((kept.folder / "a.json").read_text())
-    kept, tested = Kept(kept.folder), dataclasses.replace(CLAIMS["1"], scenes=("fern",))
+        (store.folder / f"{name}.json").write_text((store.folder / "a.json").read_text())
+    store, tested = RowStore(store.folder), dataclasses.replace(CLAIMS["1"], scenes=("fern",))
     monkeypatch.setitem(CLAIMS, "1", tested)
-    assert judged(tested, kept).keys() == {"fern", "a", "b", "c"}
-    assert re.findall(r"^\*\*(.*)\*\*:", details("1", kept), re.MULTILINE) == ["a", "b", "c", "fern"]
-    assert gains("1", kept).splitlines()[0] == "| setting | mean | a | b | fern |"
+    assert judged(tested, store).keys() == {"fern", "a", "b", "c"}
+    assert re.findall(r"^\*\*(.*)\*\*:", details("1", store), re.MULTILINE) == ["a", "b", "c", "fern"]
+    assert gains("1", store).splitlines()[0] == "| setting | mean | a | b | fern |"
 
 
-def test_a_relative_check_divides_by_the_other_figure(kept):
+def test_a_relative_check_divides_by_the_other_figure(store):
     claim = Claim("", "", (), (Check("test psnr", {"regularizer": "dropout(0.2)"}, {}, -0.04, 0.04, relative=True),))
-    assert judged(claim, kept)["b"] == (2, "fails")  # -5 and -5.4 %
-    assert judged(claim, kept)["a"] == (3, "fails")
+    assert judged(claim, store)["b"] == (2, "fails")  # -5 and -5.4 %
+    assert judged(claim, store)["a"] == (3, "fails")
 
 
-def test_pages_are_made_again_between_their_marks(kept):
+def test_pages_are_made_again_between_their_marks(store):
     text = "before\n<!-- paper claims -->\nstale words\n<!-- end -->\nafter\n<!-- paper details -->\n<!-- end -->\n"
-    made = page(text, kept)
-    assert made == page(made, kept)
+    made = page(text, store)
+    assert made == page(made, store)
     assert made.startswith("before\n<!-- paper claims -->\n|  | claim |")
-    assert details("1", kept) in made
+    assert details("1", store) in made
     # Half of their settings at most, or no path.
     assert "\nNot yet measured after 3,000 steps: 2, 3, 4, 5, 7, 8, 9, 10, 11, 14, 15, 16, 17" in made
     assert "stale" not in made
 
 
-def test_a_mark_names_one_comparison_and_its_iterations(kept):
+def test_a_mark_names_one_comparison_and_its_iterations(store):
     text = "<!-- paper details 1 100 -->\n<!-- end -->\n"
-    rows = Rows(kept.folder / "a.json")
+    rows = Rows(store.folder / "a.json")
     for setting in CLAIMS["1"].settings:
         rows.add({**row(25.0), "setting": resolved(setting, "3dgs", 100)})
-    assert page(text, kept).count("| 1 | 25 |") == 2
-    assert "Not yet measured." in page(text.replace("100", "50"), kept)
+    assert page(text, store).count("| 1 | 25 |") == 2
+    assert "Not yet measured." in page(text.replace("100", "50"), store)
 
 
 @pytest.fixture
-def drawn(monkeypatch):
-    """The figures that were drawn."""
+def figures(monkeypatch):
+    """The figures that were plotted."""
     figures = []
 
     @contextmanager
@@ -188,33 +188,33 @@ def drawn(monkeypatch):
     return figures
 
 
-def test_the_figure_draws_means_of_differences_where_three_places_are_kept(kept, drawn):
+def test_the_figure_plots_means_of_differences_where_three_places_are_kept(store, figures):
     gained = [0.5, 0.4, 0.9]
-    with pytest.raises(ValueError, match="no line to draw"):
-        gains_figure(kept, kept.folder / "gains.png")
-    rows = Rows(kept.folder / "a.json")
+    with pytest.raises(ValueError, match="no line to plot"):
+        gains_figure(store, store.folder / "gains.png")
+    rows = Rows(store.folder / "a.json")
     for seed, plain in enumerate((20.0, 20.2, 19.9)):
         rows.add(row(plain + gained[seed], seed, regularizer="dropout(0.1)"))
-    gains_figure(Kept(kept.folder), kept.folder / "gains.png")
-    assert [len(panel.containers) for panel in drawn[0].axes] == [1, 0]  # other scenes and axes have two places at most
-    (bars,) = drawn[0].axes[0].containers
+    gains_figure(RowStore(store.folder), store.folder / "gains.png")
+    assert [len(panel.containers) for panel in figures[0].axes] == [1, 0]  # the others have two places at most
+    (bars,) = figures[0].axes[0].containers
     line, _, (errors,) = bars
     assert bars.get_label() == "a"
     assert np.allclose(line.get_xydata(), [(0.0, 0.0), (0.1, np.mean(gained)), (0.2, 1.0)])
     assert np.allclose(np.ptp(errors.get_segments()[1], 0), (0.0, 4 * np.std(gained, ddof=1) / math.sqrt(3)))
-    assert (kept.folder / "gains.png").stat().st_size > 1_000
+    assert (store.folder / "gains.png").stat().st_size > 1_000
 
 
-def test_the_ranking_draws_the_best_setting_first_and_the_score_beside_it(kept, drawn):
+def test_the_ranking_plots_the_best_setting_first_and_the_score_beside_it(store, figures):
     with pytest.raises(ValueError, match="claim 11: nothing to rank"):
-        ranking_figure(kept, ["7", "11"], kept.folder / "ranking.png")
-    rows = Rows(kept.folder / "a.json")
+        ranking_figure(store, ["7", "11"], store.folder / "ranking.png")
+    rows = Rows(store.folder / "a.json")
     for seed, of in rows.of(resolved({}, "3dgs", 3_000)).items():
         better = row(of["test"]["psnr"] + 3.0 + seed, seed, regularizer="dropout(0.3)")
         for each, score in ((of, 8e-3), (better, 2e-3)):
             rows.add(each | {"test": each["test"] | {"ca_exact_half": score}})
-    ranking_figure(Kept(kept.folder), ["7"], kept.folder / "ranking.png")
-    gained, score = drawn[0].axes
+    ranking_figure(RowStore(store.folder), ["7"], store.folder / "ranking.png")
+    gained, score = figures[0].axes
     assert [tick.get_text() for tick in gained.get_yticklabels()] == ["dropout 0.2", "dropout 0.3"]  # 0.3 lacks b
     assert [bars.get_label() for bars in gained.containers] == ["a", "b"]
     on_a, on_b = (bars[0].get_xydata() for bars in gained.containers)
@@ -233,7 +233,7 @@ def test_the_ranking_draws_the_best_setting_first_and_the_score_beside_it(kept, 
     ids=lambda path: f"{path.parent.name}/{path.name}",
 )
 def test_the_pages_show_what_is_kept(path):
-    assert page(path.read_text("utf-8"), Kept(ROOT / "benchmarks" / "data" / "paper")) == path.read_text("utf-8")
+    assert page(path.read_text("utf-8"), RowStore(ROOT / "benchmarks" / "data" / "paper")) == path.read_text("utf-8")
 
 
 FOLDERS = {"the built-in scene": "synthetic", "DTU scan24": "dtu-scan24", "DTU scan65": "dtu-scan65"}
@@ -241,21 +241,21 @@ FOLDERS = {"the built-in scene": "synthetic", "DTU scan24": "dtu-scan24", "DTU s
 
 def test_what_dropout_gained_is_what_was_measured():
     """The figures of the rule against the kept rows of the study."""
-    kept = Kept(ROOT / "benchmarks" / "data" / "paper")
+    store = RowStore(ROOT / "benchmarks" / "data" / "paper")
     for number, measured in (*DROPOUT_GAINS.items(), (3, FAR_APART_GAINS)):
         views = {} if number == 3 else {"views": number}
         for (name, rate), gain in measured.items():
             check = Check("test psnr", {"regularizer": f"dropout({rate})"} | views, views)
-            found = differences(check, FOLDERS.get(name, name), kept)
+            found = differences(check, FOLDERS.get(name, name), store)
             assert gain == pytest.approx(np.mean(found), abs=0.051)
 
 
 def test_no_scene_is_left_out_of_what_is_said_of_dropout():
     """Above all none where it loses: every scene with three pairs of plain and dropout 0.2."""
-    kept = Kept(ROOT / "benchmarks" / "data" / "paper")
+    store = RowStore(ROOT / "benchmarks" / "data" / "paper")
     check = Check("test psnr", {"regularizer": "dropout(0.2)"}, {})
     scenes = {path.stem for path in (ROOT / "benchmarks" / "data" / "paper").glob("*.json")}
-    measured = {scene for scene in scenes if len(differences(check, scene, kept)) >= 3}
+    measured = {scene for scene in scenes if len(differences(check, scene, store)) >= 3}
     said = {FOLDERS.get(name, name) for name, rate in (*DROPOUT_GAINS[3], *FAR_APART_GAINS) if rate == 0.2}
     assert said == measured, "plan_rules.py, DROPOUT_GAINS[3] or FAR_APART_GAINS"
 

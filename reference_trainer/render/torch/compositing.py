@@ -216,9 +216,9 @@ class _BlendWeights(torch.autograd.Function):
         # w_i = alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j).
         alpha = raw.clamp(max=MAX_ALPHA)
         passed = 1 - alpha
-        behind = _running(passed, product=True)
+        remaining = _running(passed, product=True)
         # Zero from the first splat on that would leave too little light.
-        transmittance = torch.where(behind >= MIN_TRANSMITTANCE, behind / passed, 0.0)
+        transmittance = torch.where(remaining >= MIN_TRANSMITTANCE, remaining / passed, 0.0)
         weights = alpha.mul_(transmittance)
         ctx.save_for_backward(passed, transmittance, weights)
         return weights

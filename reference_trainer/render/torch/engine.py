@@ -108,7 +108,7 @@ class TorchEngine:
         return splats._replace(opacities=opacities, lists=splats.lists.only(opacities >= MIN_ALPHA))
 
     def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Draw splats front to back."""
+        """Render splats front to back."""
         values = [splats.colors.T, splats.projection.depths[None]] if depth else [splats.colors.T]
         shape = (splats.lists.height, splats.lists.width)
         background = torch.nn.functional.pad(background, (0, len(values) - 1))[:, None, None].expand(-1, *shape)
@@ -117,7 +117,7 @@ class TorchEngine:
         return sums[:3], sums[-1], sums[3] if depth else None
 
     def composite_masks(self, splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
-        """Draw one picture after the other."""
+        """Render one image after the other."""
         rendered = (self.composite(self.masked(splats, row), background, depth=False) for row in opacities)
         images, alphas, _ = zip(*rendered, strict=True)
         return torch.stack(images), torch.stack(alphas)

@@ -62,22 +62,22 @@ class GsplatMoments:
             ValueError: if ``meta`` is of several cameras or of tiles whose side is no power of two, or the colors are
                 not RGB of all Gaussians.
         """
-        table, lists, behind, _ = self._prepared(opacity, view, multiplier, background)
-        return ExactMoments(*moments_of(table, lists, behind))
+        table, lists, background, _ = self._prepared(opacity, view, multiplier, background)
+        return ExactMoments(*moments_of(table, lists, background))
 
     def shares(
         self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None, weights: Tensor
     ) -> Tensor:
         """Return every Gaussian's share of the weighted variance, (N,), float64, as `ca_reg.ListMoments.shares`."""
-        table, lists, behind, which = self._prepared(opacity, view, multiplier, background)
-        found = shares_of(table, lists, behind, weights.to(table))
+        table, lists, background, which = self._prepared(opacity, view, multiplier, background)
+        found = shares_of(table, lists, background, weights.to(table))
         return found if which is None else found.new_zeros(len(opacity)).index_add(0, which, found)
 
     @torch.no_grad()
     def _prepared(
         self, opacity: Tensor, view: Any, multiplier: Multiplier, background: Tensor | None
     ) -> tuple[Tensor, Lists, Tensor, Tensor | None]:
-        """Return the table of the listed splats, the lists, what is behind, and which Gaussians the splats are."""
+        """Return the table of the listed splats, the lists, the background, and which Gaussians the splats are."""
         with unregularized_calls():
             colors, meta = self.rasterize(opacity, view)
         if meta["isect_offsets"].shape[:-2].numel() != 1:
@@ -107,8 +107,8 @@ class GsplatMoments:
         starts = torch.cat([meta["isect_offsets"].flatten().int(), ids.new_full((1,), len(ids))])
         lists = Lists(starts, ids, size[2], size[1], tile, self.max_alpha or _max_alpha())
         background = self.background if background is None else background
-        behind = a.new_zeros(3) if background is None else background.to(a)
-        return table, lists, (behind if behind.ndim == 3 else behind[:, None, None]).expand(size), which
+        background = a.new_zeros(3) if background is None else background.to(a)
+        return table, lists, (background if background.ndim == 3 else background[:, None, None]).expand(size), which
 
 
 def _max_alpha() -> float:

@@ -50,7 +50,7 @@ class Case:
         beyond: what is allowed above it: an error that names the mistake; a documented limit, finite but less exact; or
             an infinity where the dtype has no larger number.
         note: the documented limit, or what refuses.
-        draws: whether it uses an engine of the renderer; if not, it is judged once for all engines.
+        renders: whether it uses an engine of the renderer; if not, it is judged once for all engines.
     """
 
     family: str
@@ -60,14 +60,14 @@ class Case:
     until: float = math.inf
     beyond: Literal["refused", "limit", "overflow"] = "limit"
     note: str = ""
-    draws: bool = True
+    renders: bool = True
 
 
-def single(family: str, name: str, probe: Callable[[], Probe], *, refused: str = "", draws: bool = True) -> Case:
+def single(family: str, name: str, probe: Callable[[], Probe], *, refused: str = "", renders: bool = True) -> Case:
     """Return a case without a scale, which must be right, or may be refused if ``refused`` names by what."""
     # The only magnitude is 1: with 0 it lies beyond what must be right.
     until = 0.0 if refused else math.inf
-    return Case(family, name, lambda _: probe(), until=until, beyond="refused", note=refused, draws=draws)
+    return Case(family, name, lambda _: probe(), until=until, beyond="refused", note=refused, renders=renders)
 
 
 def decades(first: int, last: int, step: int = 1) -> tuple[float, ...]:
@@ -267,11 +267,11 @@ def _blend_cases() -> list[Case]:
         *(single(_OPACITY, f"opacities {name}", partial(_opacities, x)) for name, x in _OPACITIES.items()),
         Case(
             _OPACITY, "opacity logits", _logits, _LOGITS, until=10.0,
-            note="the gradient, o (1 - o), loses its digits and is 0 from 17 on: 1 is the next float32", draws=False,
+            note="the gradient, o (1 - o), loses its digits and is 0 from 17 on: 1 is the next float32", renders=False,
         ),
         Case(
             _OPACITY, "opacity logits, negative", lambda x: _logits(-x), _LOGITS, until=50.0,
-            note="below 1e-38 there is no float32", draws=False,
+            note="below 1e-38 there is no float32", renders=False,
         ),
         *(Case(_BLEND, f"Gaussians on one pixel, opacity {o}", partial(_stacked, o), decades(0, 4)) for o in _STACKS),
         Case(
@@ -291,8 +291,8 @@ def _blend_cases() -> list[Case]:
         ),
         Case(_RANDOM, "sigma of the opacity noise", _noise, _SIGMAS),
         single(_RANDOM, "opacity noise of sigma 0", partial(_noise, 0.0)),
-        Case(_RANDOM, "renders K of a score", _renders, (2.0, 100.0, 10_000.0), draws=False),
-        single(_RANDOM, "K = 1", partial(_renders, 1.0), refused="the variance of one render", draws=False),
+        Case(_RANDOM, "renders K of a score", _renders, (2.0, 100.0, 10_000.0), renders=False),
+        single(_RANDOM, "K = 1", partial(_renders, 1.0), refused="the variance of one render", renders=False),
         single(_RANDOM, "no visible pixel: no score, but a reason", partial(_opacities, 0.01)),
         single(_COLOR, "black background", partial(_colored, False, 0.0)),
         *(
@@ -301,7 +301,7 @@ def _blend_cases() -> list[Case]:
         ),
         single(_DTYPE, "float16 inputs", lambda: of_scene(base_scene(), dtype=torch.float16)),
         single(_DTYPE, "bfloat16 inputs", lambda: of_scene(base_scene(), dtype=torch.bfloat16)),
-        single(_DTYPE, "moments of lists in float16", _short_lists, refused="its checks", draws=False),
+        single(_DTYPE, "moments of lists in float16", _short_lists, refused="its checks", renders=False),
         single(_DTYPE, "torch.autocast to bfloat16", _autocast),
     ]  # fmt: skip
 
@@ -332,14 +332,14 @@ def _stacked(opacity: float, count: float) -> Probe:
 
 
 def _one_plane() -> Probe:
-    """Put all Gaussians at one depth: they must be drawn in storage order."""
+    """Put all Gaussians at one depth: they must be rendered in storage order."""
     camera = Camera(torch.eye(4, dtype=torch.float64), 40.0, 38.0, 15.0, 12.7, 32, 24)
     scene = base_scene(camera=camera)
     return of_scene(replace(scene, means=torch.cat([scene.means[:, :2], torch.full((24, 1), 3.0).double()], dim=1)))
 
 
 def _copies(count: float) -> Probe:
-    """Draw copies of one Gaussian in different colors: rounding must not change the order of equal depths."""
+    """Render copies of one Gaussian in different colors: rounding must not change the order of equal depths."""
     n = int(count)
     scene = base_scene(n)
     # All but the colors, which reveal the order of equal depths.
@@ -409,8 +409,8 @@ def _renders(count: float) -> Probe:
 def _colored(hdr: bool, background: float) -> Probe:
     """Set the background; for HDR colors, scale them by it."""
     scene = base_scene()
-    behind = torch.full_like(scene.background, background)
-    return of_scene(replace(scene, background=behind, colors=scene.colors * (background if hdr else 1.0)))
+    colors = scene.colors * (background if hdr else 1.0)
+    return of_scene(replace(scene, background=torch.full_like(scene.background, background), colors=colors))
 
 
 def _short_lists() -> Probe:

@@ -106,7 +106,7 @@ def render_simply(
     """Render Gaussians over black by the textbook formulas, tile by tile, with autograd's own backward pass: (3, H, W).
 
     A tile of 16 x 16 pixels considers every Gaussian whose bounding box at alpha = 1/255 overlaps it, so nothing that
-    the definition draws is left out: in float64 the result is that of brute force. All pixel-Gaussian pairs are kept
+    the definition renders is left out: in float64 the result is that of brute force. All pixel-Gaussian pairs are kept
     for the backward pass.
 
     Convention: OpenCV camera, half-pixel centers, wxyz quaternions of any norm; the constants of the INRIA rasterizer;
@@ -175,8 +175,8 @@ def _blend(pixels: Tensor, centers: Tensor, inverses: Tensor, opacities: Tensor,
     raw = opacities * torch.exp(-0.5 * power)
     alpha = raw + (raw.clamp(max=_MAX_ALPHA) - raw).detach()
     alpha = torch.where(raw >= _MIN_ALPHA, alpha, 0.0)
-    behind = torch.cumprod(1 - alpha, dim=1)
-    weights = torch.where(behind >= _MIN_LIGHT, alpha * behind / (1 - alpha), 0.0)
+    remaining = torch.cumprod(1 - alpha, dim=1)
+    weights = torch.where(remaining >= _MIN_LIGHT, alpha * remaining / (1 - alpha), 0.0)
     return weights @ colors
 
 
@@ -215,8 +215,8 @@ def scene_quantities(
     result |= _gradients(loss, [leaves.means], ["d variance"])
 
     def exact(opacity: Tensor, view: None, multiplier: Multiplier, background: Tensor | None) -> object:
-        behind = scene.background if background is None else background
-        return render_moments(splats_of(replace(scene, opacities=opacity)), multiplier, background=behind)
+        background = scene.background if background is None else background
+        return render_moments(splats_of(replace(scene, opacities=opacity)), multiplier, background=background)
 
     score = CAScore.exact(exact, drop_rate=rate, threshold=0.5)(scene.opacities, None)
     result["CA"] = torch.tensor([score.value], dtype=torch.float64)

@@ -127,7 +127,7 @@ _FLOOR = 1e-9  # lower end of the figure's color scale
 
 
 def study_stability(out: Path) -> Records:
-    """Push both engines of the renderer and the functions of `ca_reg` to extremes, and report where and how they fail.
+    """Push the CPU's engines and the functions of `ca_reg` to extremes, and report where and how they fail.
 
     Raises a RuntimeError that lists the cases which end other than declared, after everything is written.
     """
@@ -138,20 +138,20 @@ def study_stability(out: Path) -> Records:
 
 
 def stability_study() -> Study:
-    """Declare the study: every case once per available engine, or once in total if it draws nothing.
+    """Declare the study: every case once per available engine, or once in total if it renders nothing.
 
     Records are not kept once the study is finished: the next call checks the program as it is then.
     """
     cases = {}
     for number, case in enumerate(all_cases()):
-        for engine in engines_on(torch.device("cpu")) if case.draws else [None]:
+        for engine in engines_on(torch.device("cpu")) if case.renders else [None]:
             name = f"{case.family}: {case.name}" + (f" ({engine})" if engine else "")
             cases[name] = {"number": number, "engine": engine}
-    return Study("stability", judge_with, cases, _report, _draw, check=True)
+    return Study("stability", judge_with, cases, _report, _plot, check=True)
 
 
 def judge_with(number: int, engine: str | None) -> Record:
-    """Judge a case, by its index in `all_cases`, with an engine; None for a case that draws nothing."""
+    """Judge a case, by its index in `all_cases`, with an engine; None for a case that renders nothing."""
     start, case = perf_counter(), _with_one_reference(all_cases()[number])
     if engine is None:
         record = judge(case)
@@ -205,7 +205,7 @@ def _report(records: Records) -> str:
     lines = [
         f"{about['cpu']}, torch {about['torch']}: {sum(len(case['points']) for case in cases)} magnitudes in "
         f"{sum(case['seconds'] for case in cases):.0f} s. Right is an error of at most {VALUE_TOLERANCE:g}, of "
-        f"gradients (d) {GRADIENT_TOLERANCE:g}: the norm of the difference over that of the reference. What draws "
+        f"gradients (d) {GRADIENT_TOLERANCE:g}: the norm of the difference over that of the reference. What renders "
         "nothing in float32 is judged once and counted for every engine.",
         "",
         markdown_table(rows, columns),
@@ -245,8 +245,8 @@ def _ending_row(case: Record) -> dict[str, object]:
     }
 
 
-def _draw(records: Records, figure: Any) -> None:
-    """Draw the errors of every case and quantity as a heat map, of the worst engine; the tables have all engines."""
+def _plot(records: Records, figure: Any) -> None:
+    """Plot the errors of every case and quantity as a heat map, of the worst engine; the tables have all engines."""
     cases: dict[tuple[str, str], list[Record]] = {}
     for record in records.values():
         if _worst_errors(record):

@@ -98,7 +98,7 @@ class AdaptiveDensity(DensityStrategy):
         return step < self.config.densify_end
 
     def observe(self, splats: ViewSplats, camera: Camera) -> None:
-        """Count the gradients of the Gaussians that were drawn."""
+        """Count the gradients of the Gaussians that were rendered."""
         means = splats.means
         assert means.grad is not None
         absolute = means.absgrad if "absgrad" in self.needs else None  # type: ignore[attr-defined]
@@ -165,6 +165,6 @@ class AbsGradDensity(AdaptiveDensity):
         """Select large Gaussians by their absolute gradients."""
         seen = self.statistics
         assert seen.absolute_sum is not None
-        # A mean over the steps that drew it, like the signed gradient that decides about clones.
+        # A mean over the steps that rendered it, like the signed gradient that decides about clones.
         torn = seen.absolute_sum / seen.steps.clamp(min=1) >= self.split_gradient
         return torch.where(is_large(optimizer, self.large), torn, super().selected(optimizer))

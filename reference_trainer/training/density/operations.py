@@ -21,15 +21,15 @@ __all__ = [
 
 @dataclass
 class DensityStatistics:
-    """Gradients of every Gaussian, and steps that drew it, since the last densification.
+    """Gradients of every Gaussian, and steps that rendered it, since the last densification.
 
-    A Gaussian that a step did not draw (outside the view, or dropped by a regularizer) is not counted in that step. If
-    dropped Gaussians were counted with their zero gradient, the threshold would in effect rise by 1 / (1 - p).
+    A Gaussian that a step did not render (outside the view, or dropped by a regularizer) is not counted in that step.
+    If dropped Gaussians were counted with their zero gradient, the threshold would in effect rise by 1 / (1 - p).
 
     Args:
         gradient_sum: summed norms of the loss gradient with respect to the projected center in normalized device
             coordinates, as in the INRIA code: times half the image size, shape (N,).
-        steps: the number of steps that drew it, shape (N,).
+        steps: the number of steps that rendered it, shape (N,).
         absolute_sum: as ``gradient_sum``, of absolute gradients; None where they are not used.
     """
 
@@ -85,7 +85,7 @@ class DensityStatistics:
 
     @property
     def mean_gradient(self) -> Tensor:
-        """Mean gradient norm over the steps that drew a Gaussian; 0 where none did, shape (N,)."""
+        """Mean gradient norm over the steps that rendered a Gaussian; 0 where none did, shape (N,)."""
         return self.gradient_sum / self.steps.clamp(min=1)
 
 

@@ -135,7 +135,7 @@ class SelfEnsembling(CoPruning):
     the source compares a squared distance with a radius.) Two pictures of every view are kept, also in checkpoints.
 
     Defaults are the source's for LLFF (sailor-z/SE-GS 43668d7, train_llff.py); one thing differs: Gaussians too faint
-    to be drawn, below 1/255, are not perturbed. Dropped Gaussians: as in `CoPruning`; the plain model is rendered.
+    to be rendered, below 1/255, are not perturbed. Dropped Gaussians: as in `CoPruning`; the plain model is rendered.
 
     Args:
         distance: as in `CoPruning`.

@@ -27,8 +27,8 @@ class DensityStrategy(abc.ABC):
     then `observe` for every render that trains, then updates the Gaussians. What it counts must be in `state_dict`, so
     that a resumed training is the same.
 
-    Gaussians that a regularizer dropped are not drawn: `observe` must not count them as seen. If they were counted with
-    their gradient of zero, a threshold would in effect rise by 1 / (1 - p).
+    Gaussians that a regularizer dropped are not rendered: `observe` must not count them as seen. If they were counted
+    with their gradient of zero, a threshold would in effect rise by 1 / (1 - p).
 
     Attributes:
         needs: what it requires: ``"absgrad"`` of the renderer, for ``splats.means.absgrad``, the sums of
@@ -100,7 +100,7 @@ class DensityStrategy(abc.ABC):
         """Count a render whose gradients have been computed.
 
         Args:
-            splats: what was drawn; ``splats.means.grad`` is the gradient per pixel of the projected centers.
+            splats: what was rendered; ``splats.means.grad`` is the gradient per pixel of the projected centers.
             camera: of the render.
         """
 

@@ -70,7 +70,7 @@ def _error(image, target, variance, place, inside, EXPECTED: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["width", "height"])
-def blur_pictures(
+def blur_images(
     image, target, variance, blurred, width, height,
     EXPECTED: tl.constexpr, WIDE: tl.constexpr, HIGH: tl.constexpr,
 ):  # fmt: skip
@@ -94,7 +94,7 @@ def blur_pictures(
 
 
 @triton.jit(do_not_specialize=["width", "height"])
-def compare_pictures(
+def compare_images(
     blurred, image, target, variance, slopes, out, width, height, of_error, of_ssim,
     EXPECTED: tl.constexpr, LOSS: tl.constexpr, WIDE: tl.constexpr, HIGH: tl.constexpr,
 ):  # fmt: skip
@@ -170,32 +170,32 @@ class _Photometric(torch.autograd.Function):
     ) -> Tensor:
         planes, height, width = image.shape
         image, target = image.contiguous(), target.contiguous()
-        pictures = image, target, image if variance is None else variance.contiguous()  # read only if there is one
+        images = image, target, image if variance is None else variance.contiguous()  # read only if there is one
         ctx.grid = -(-width // _WIDE), -(-height // _HIGH), planes
         ctx.constants = {"WIDE": _WIDE, "HIGH": _HIGH, "warps": _WARPS}
         ctx.expected, ctx.weights = variance is not None, weights
         blurred, slopes = image.new_empty(4, *image.shape), image.new_empty(3, *image.shape)
         out = torch.empty_like(image) if weights is None else image.new_empty(math.prod(ctx.grid))
-        launch(blur_pictures, ctx.grid, *pictures, blurred, width, height, EXPECTED=ctx.expected, **ctx.constants)
+        launch(blur_images, ctx.grid, *images, blurred, width, height, EXPECTED=ctx.expected, **ctx.constants)
         launch(
-            compare_pictures, ctx.grid, blurred, *pictures, slopes, out, width, height, *(weights or (0.0, 0.0)),
+            compare_images, ctx.grid, blurred, *images, slopes, out, width, height, *(weights or (0.0, 0.0)),
             EXPECTED=ctx.expected, LOSS=weights is not None, **ctx.constants,
         )  # fmt: skip
-        ctx.save_for_backward(*pictures, slopes)
+        ctx.save_for_backward(*images, slopes)
         return out if weights is None else out.sum()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        *pictures, slopes = ctx.saved_tensors
-        _, height, width = pictures[0].shape
+        *images, slopes = ctx.saved_tensors
+        _, height, width = images[0].shape
         if ctx.weights is None:
             slopes = slopes * gradient
-        blurred, to_image = torch.empty_like(slopes), torch.empty_like(pictures[0])
+        blurred, to_image = torch.empty_like(slopes), torch.empty_like(images[0])
         to_variance = torch.empty_like(to_image) if ctx.expected else to_image  # written only if there is one
         launch(blur_slopes, ctx.grid, slopes, blurred, width, height, **ctx.constants)
         launch(
-            gather_gradients, ctx.grid, blurred, *pictures, gradient, to_image, to_variance, width, height,
+            gather_gradients, ctx.grid, blurred, *images, gradient, to_image, to_variance, width, height,
             *(ctx.weights or (0.0, 0.0)), EXPECTED=ctx.expected, LOSS=ctx.weights is not None, **ctx.constants,
         )  # fmt: skip
         return to_image, None, to_variance if ctx.expected else None, None

@@ -166,7 +166,7 @@ class SmoothDepth(WeightedTerm):
     """``weight`` times kornia's inverse_depth_smoothness_loss of ``alpha / depth`` over its mean (Monodepth2, 2019).
 
     ``sum over x and y of mean |dD| exp(-mean |dI|)``: forward differences, I the photograph, D the inverse mean depth
-    of a pixel, 0 where nothing is drawn, divided by its own mean so that the unit of length does not matter.
+    of a pixel, 0 where nothing is rendered, divided by its own mean so that the unit of length does not matter.
 
     Args:
         weight: at least 0, or a schedule. Monodepth2 uses 0.001.

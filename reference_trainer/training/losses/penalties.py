@@ -1,4 +1,4 @@
-"""Penalties on the Gaussians themselves, and on what is drawn where nothing is."""
+"""Penalties on the Gaussians themselves, and on what is rendered where nothing is."""
 
 from __future__ import annotations
 

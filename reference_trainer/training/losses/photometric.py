@@ -224,8 +224,8 @@ def _blur(maps: Tensor) -> Tensor:
 class Views(WeightedTerm):
     """``weight`` times the sum of the photometric losses of n - 1 further training views (MVGS, 2024).
 
-    Each is drawn like the view of the step, with its own draw of the regularizers, and counted by density control (the
-    source counts the last one alone). ``photometric + views(3)`` makes three views a step.
+    Each is rendered like the view of the step, with its own draw of the regularizers, and counted by density control
+    (the source counts the last one alone). ``photometric + views(3)`` makes three views a step.
 
     Args:
         n: views in a step, including the step's own, at least 2; all, if there are fewer training views.
@@ -241,7 +241,7 @@ class Views(WeightedTerm):
         self.n, self.photometric = n, Photometric(lambda_dssim)
 
     def value(self, step: Step) -> Tensor:
-        """Draw the views and compare each with its photograph."""
+        """Render the views and compare each with its photograph."""
         others = [view for view in step.views if view.name != step.view.name]
         generator = step.generator("views")
         order = torch.randperm(len(others), generator=generator, device=generator.device)[: self.n - 1]

@@ -32,12 +32,12 @@ def test_a_run_or_a_ply_is_shown_until_ctrl_c(what, trained, capsys, monkeypatch
     pytest.importorskip("viser")
     shown = []
 
-    def draw(viewer):
+    def update(viewer):
         for model in viewer._models.values():
             shown.append(model.render(viewer._options, model.views[0].camera).image)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Viewer, "update", draw)
+    monkeypatch.setattr(Viewer, "update", update)
     main(["view", *(str(trained / name) for name in what), "--port", "0"])
     assert re.search(r"The viewer is at http://127\.0\.0\.1:\d+, .*; Ctrl-C ends it\.", capsys.readouterr().out)
     assert [bool(image.std() > 0) for image in shown] == [True] * len(what)
@@ -223,7 +223,7 @@ def test_what_would_be_lost_is_refused(trained, capsys, tmp_path):
 
 
 def test_nothing_is_written_to_the_photographs_or_over_other_files(trained, capsys, tmp_path):
-    """By the commands that measure and draw, wherever they may write."""
+    """By the commands that measure and render, wherever they may write."""
     garden, other, run = tmp_path / "garden", tmp_path / "other", tmp_path / "run"
     for folder in (garden / "images", other, run):
         folder.mkdir(parents=True)

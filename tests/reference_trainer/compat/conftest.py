@@ -39,7 +39,7 @@ def settings_of() -> Callable[..., GaussianRasterizationSettings]:
 
 
 class _MovedCamera:
-    """A camera whose principal point is another one for every Gaussian that the brute-force renderer draws."""
+    """A camera whose principal point is another one for every Gaussian that the brute-force renderer renders."""
 
     def __init__(self, camera: Camera, shifts: Tensor, order: list[int]) -> None:
         self._camera, self._shifts = camera, shifts

@@ -8,7 +8,7 @@ from reference_trainer.compat.rasterizer import rasterizer_module
 from reference_trainer.render.torch.projection import project
 
 
-def test_scores_are_sums_over_the_pixels_at_which_a_gaussian_is_drawn(settings_of):
+def test_scores_are_sums_over_the_pixels_at_which_a_gaussian_is_rendered(settings_of):
     n, width, height = 30, 21, 17
     scene = random_scene(n, width, height, seed=11, size=0.05)
     image = torch.rand(height, width, generator=torch.Generator().manual_seed(1)).double()
@@ -20,7 +20,7 @@ def test_scores_are_sums_over_the_pixels_at_which_a_gaussian_is_drawn(settings_o
         colors_precomp=scene.colors, scales=scene.scales, rotations=scene.quaternions,
     )  # fmt: skip
     weights, _ = brute_force(*scene[:4], torch.eye(n).double(), scene.camera)
-    drawn = weights > 0
+    covered = weights > 0
     local = scene.means @ scene.camera.world_to_camera[:3, :3].T + scene.camera.world_to_camera[:3, 3]
     front = local[:, 2] > 0.2
     centers = torch.zeros(n, 2).double()
@@ -28,16 +28,16 @@ def test_scores_are_sums_over_the_pixels_at_which_a_gaussian_is_drawn(settings_o
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     distances = torch.hypot(columns - centers[:, 0, None, None], rows - centers[:, 1, None, None])
     torch.testing.assert_close(accum_blend, weights.sum((1, 2)), rtol=1e-9, atol=1e-12)
-    torch.testing.assert_close(accum_count, drawn.sum((1, 2)).double(), rtol=0, atol=0)
-    torch.testing.assert_close(accum_weights, (drawn * image).sum((1, 2)), rtol=1e-9, atol=1e-12)
-    torch.testing.assert_close(accum_dist, (drawn * distances).sum((1, 2)), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(accum_count, covered.sum((1, 2)).double(), rtol=0, atol=0)
+    torch.testing.assert_close(accum_weights, (covered * image).sum((1, 2)), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(accum_dist, (covered * distances).sum((1, 2)), rtol=1e-9, atol=1e-9)
     seen = accum_count > 0
     torch.testing.assert_close(depths[seen], local[seen, 2], rtol=1e-12, atol=0)
     assert 5 < seen.sum() < n
     assert torch.equal(my_radii, radii)
 
 
-def test_pixels_are_those_at_which_a_gaussian_is_drawn(settings_of):
+def test_pixels_are_those_at_which_a_gaussian_is_rendered(settings_of):
     scene = random_scene(30, 21, 17, seed=11, size=0.05)
     rasterizer = rasterizer_module("diff_gaussian_rasterization").GaussianRasterizer(settings_of(scene.camera))
     _, _, pixels = rasterizer(
@@ -48,7 +48,7 @@ def test_pixels_are_those_at_which_a_gaussian_is_drawn(settings_of):
     assert torch.equal(pixels, (weights > 0).sum((1, 2))[:, None].double())
 
 
-def test_what_antialiasing_makes_invisible_is_drawn_at_no_pixel(settings_of):
+def test_what_antialiasing_makes_invisible_is_rendered_at_no_pixel(settings_of):
     """Specks in the very middle of pixels, as pixel-aligned models have: there alone rounding could decide."""
     camera = Camera(torch.eye(4), 40.0, 40.0, 20.0, 20.0, 40, 40)
     rows, columns = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(40) + 0.5, indexing="ij")
@@ -68,7 +68,7 @@ def _weights(scene):
     return brute_force(*scene[:4], torch.eye(30).double(), scene.camera)[0]
 
 
-def test_pixels_of_a_map_are_counted_where_a_gaussian_is_drawn(settings_of):
+def test_pixels_of_a_map_are_counted_where_a_gaussian_is_rendered(settings_of):
     """As FastGS does, if its flag is set."""
     scene = random_scene(30, 21, 17, seed=11, size=0.05)
     chosen = torch.rand(17, 21, generator=torch.Generator().manual_seed(3)) > 0.6

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from reference_trainer.compat.outputs import SAY_IT, Picture, Unknown, kinds_of
+from reference_trainer.compat.outputs import SAY_IT, Planes, Unknown, kinds_of
 
 
 @pytest.mark.parametrize(
@@ -110,13 +110,13 @@ def test_an_unknown_value_is_not_none():
 
 @pytest.mark.parametrize("index", [3, slice(3, 6), slice(2, 5), (8, slice(None)), (slice(3, None), 0), (7, ..., None)])
 def test_a_channel_that_a_picture_does_not_have_is_asked_for_by_its_number(index):
-    with pytest.raises(ValueError, match=r"channel [3-8] .* draws 3 channels: .* --outputs: .* image\+normal"):
-        torch.zeros(3, 4, 5).as_subclass(Picture)[index]
+    with pytest.raises(ValueError, match=r"channel [3-8] .* renders 3 channels: .* --outputs: .* image\+normal"):
+        torch.zeros(3, 4, 5).as_subclass(Planes)[index]
 
 
 def test_a_picture_is_a_tensor_otherwise():
     plain = torch.rand(3, 4, 5, requires_grad=True)
-    picture = (2 * plain).as_subclass(Picture)
+    picture = (2 * plain).as_subclass(Planes)
     for index in (0, -1, slice(None), slice(0, 3), slice(1, -1), (..., 0), (0, 3), plain > 0.5, None, [2, 0]):
         assert torch.equal(picture[index], (2 * plain)[index])
     assert type(picture * 1) is type(picture.detach()) is torch.Tensor
@@ -125,7 +125,7 @@ def test_a_picture_is_a_tensor_otherwise():
 
 
 def test_a_picture_is_copied_and_kept_as_a_tensor(tmp_path):
-    picture = torch.rand(3, 4, 5).as_subclass(Picture)
+    picture = torch.rand(3, 4, 5).as_subclass(Planes)
     torch.save({"render": picture}, tmp_path / "render.pt")
     for other in (copy.deepcopy(picture), torch.load(tmp_path / "render.pt", weights_only=True)["render"]):
         assert type(other) is torch.Tensor

@@ -29,7 +29,7 @@ def given(seed=3, n=N, dtype=torch.float64, **changes):
 
 
 def slow(a):
-    """Draw with gsplat's torch projection and harmonics, one Gaussian after the other at all pixels."""
+    """Render with gsplat's torch projection and harmonics, one Gaussian after the other at all pixels."""
     covariances, _ = own._quat_scale_to_covar_preci(a["quats"], a["scales"], True, False)
     radii, means2d, depths, conics, compensations = own._fully_fused_projection(
         a["means"], covariances, a["viewmats"], a["Ks"], WIDTH, HEIGHT, eps2d=a.get("eps2d", 0.3),
@@ -100,8 +100,8 @@ def test_pictures_and_gradients_are_gsplats(case):
     weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(1)).double()
     info["means2d"].retain_grad()
     means2d.retain_grad()
-    for drawn, light in ((image, alpha), (slow_image, slow_alpha)):
-        ((drawn * weights).sum() + (light * weights[..., :1]).sum()).backward()
+    for color, light in ((image, alpha), (slow_image, slow_alpha)):
+        ((color * weights).sum() + (light * weights[..., :1]).sum()).backward()
     for name in LEARNED:
         if name != "colors" or "RGB" in a.get("render_mode", "RGB"):
             torch.testing.assert_close(ours[name].grad, theirs[name].grad, rtol=1e-6, atol=1e-7, msg=name)
@@ -111,13 +111,13 @@ def test_pictures_and_gradients_are_gsplats(case):
     torch.testing.assert_close(info["means2d"][pick], means2d[seen], rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(info["means2d"].grad[pick], means2d.grad[seen], rtol=1e-6, atol=1e-7)
     torch.testing.assert_close(info["depths"][pick], depths[seen], rtol=1e-9, atol=1e-9)
-    # Who is not listed has got nothing: the fainter ones end before the rectangles that gsplat's torch code draws.
+    # Who is not listed has got nothing: the fainter ones end before the rectangles that gsplat's torch code renders.
     unseen = torch.ones_like(depths, dtype=torch.bool)
     unseen[seen] = False
     assert not means2d.grad[unseen].any()
 
 
-def test_in_single_precision_the_engine_of_the_machine_draws_the_same():
+def test_in_single_precision_the_engine_of_the_machine_renders_the_same():
     a = given(colors=harmonics(N), sh_degree=3, render_mode="RGB+ED")
     single = {k: x.float() if isinstance(x, torch.Tensor) else x for k, x in a.items()}
     leaves = [x["means"].requires_grad_() for x in (a, single)]

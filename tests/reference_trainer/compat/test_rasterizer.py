@@ -266,17 +266,17 @@ def test_outputs_may_be_written_over_before_the_backward_pass(settings_of):
     torch.testing.assert_close(*gradients)
 
 
-def test_a_gradient_that_is_nan_where_nothing_is_drawn_does_no_harm(settings_of):
+def test_a_gradient_that_is_nan_where_nothing_is_rendered_does_no_harm(settings_of):
     scene = random_scene(6, 30, 20, seed=4, size=0.05)
     gradients = []
     for divide in (False, True):
         means = scene.means.clone().requires_grad_()
         _, _, depth, alpha = _call(settings_of(scene.camera), scene._replace(means=means), DEPTH_ALPHA)
-        drawn = alpha.detach() > 0
-        ratio = depth / alpha if divide else depth / torch.where(drawn, alpha, 1.0)
+        covered = alpha.detach() > 0
+        ratio = depth / alpha if divide else depth / torch.where(covered, alpha, 1.0)
         torch.nan_to_num(ratio).sum().backward()
         gradients.append(means.grad)
-    assert 0 < drawn.sum() < drawn.numel()
+    assert 0 < covered.sum() < covered.numel()
     assert gradients[0].any()
     torch.testing.assert_close(*gradients)
 

@@ -86,15 +86,15 @@ def test_further_channels_of_the_image_are_those_of_the_planes(settings_of):
     scene = random_scene(12, 14, 9, seed=5, size=0.2)
     lengths = scene.scales * torch.tensor([1.0, 0.0, 1.0])  # flat along the second axis
 
-    def draw(*outputs):
+    def rendered(*outputs):
         module = rasterizer_module("diff_gaussian_rasterization", outputs=outputs)
         return module.GaussianRasterizer(settings_of(scene.camera))(
             means3D=scene.means, means2D=torch.zeros_like(scene.means), opacities=scene.opacities[:, None],
             colors_precomp=scene.colors, scales=lengths, rotations=scene.quaternions,
         )  # fmt: skip
 
-    picture, radii = draw("image+normal+depth+alpha+distortion", "radii")
-    apart = draw("image", "radii", "normal", "depth", "alpha", "distortion")
+    picture, radii = rendered("image+normal+depth+alpha+distortion", "radii")
+    apart = rendered("image", "radii", "normal", "depth", "alpha", "distortion")
     assert torch.equal(picture, torch.cat([apart[0], *apart[2:]]))
     assert torch.equal(radii, apart[1])
     weights, _ = brute_force(*scene[:2], lengths, scene.opacities, torch.eye(12).double(), scene.camera)
@@ -104,7 +104,7 @@ def test_further_channels_of_the_image_are_those_of_the_planes(settings_of):
     normals = torch.from_numpy(axes) @ pose[:3, :3].T
     normals = normals * -(normals * local).sum(1, keepdim=True).sign()
     torch.testing.assert_close(picture[3:6], torch.einsum("nhw,nc->chw", weights, normals), rtol=0, atol=1e-9)
-    planes = draw("image", "radii", "inverse_depth", "normal", "mean_depth", "distortion")[2:]
+    planes = rendered("image", "radii", "inverse_depth", "normal", "mean_depth", "distortion")[2:]
     inverse_depth = torch.einsum("nhw,n->hw", weights, 1 / local[:, 2])
     torch.testing.assert_close(planes[0][0], inverse_depth, rtol=0, atol=1e-9)
     assert torch.equal(planes[1], apart[2])

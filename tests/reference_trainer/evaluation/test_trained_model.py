@@ -88,8 +88,8 @@ def test_the_test_time_image_is_the_mean_of_the_training_images(model, scene, p)
     place = []
     for _ in range(300):
         opacities = noise(dropout(model.gaussians.opacities, generator=generator), generator=generator)
-        drawn = model.render(opacities, view)[0]
-        place.append(((drawn - image) * step).sum() / step.square().sum())
+        rendered = model.render(opacities, view)[0]
+        place.append(((rendered - image) * step).sum() / step.square().sum())
     found = torch.stack(place)
     error = 5 * found.std().item() / math.sqrt(len(place))  # false alarm 6e-7
     clamp = image.max().item() / 99 * (step.abs().sum() / step.square().sum()).item()  # of alpha, over black

@@ -12,7 +12,7 @@ from stand_ins.card import CARD, pretended_card
 
 @pytest.fixture(params=["torch", "numba"])
 def engine(request, monkeypatch) -> str:
-    """Each engine in turn draws what it can."""
+    """Each engine in turn renders what it can."""
     return chosen(request.param, monkeypatch)
 
 

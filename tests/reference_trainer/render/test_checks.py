@@ -14,7 +14,7 @@ from reference_trainer.render import NotFiniteError, render
 NAMES = ("means", "quaternions", "scales", "opacities", "colors")
 
 
-def draw(scene, **changes):
+def rendered(scene, **changes):
     tensors = dict(zip(NAMES, scene.tensors(), strict=True)) | {"camera": scene.camera} | changes
     return render(**tensors).image
 
@@ -36,7 +36,7 @@ def test_a_bad_number_is_refused_by_name_and_place(scene, name, bad):
     tensor, at = getattr(scene, name).clone(), seen(scene)
     tensor.view(40, -1)[at, -1] = bad
     with pytest.raises(NotFiniteError, match=f"{name} must be finite.* in 1 of 40 Gaussians, the first is number {at}"):
-        draw(scene, **{name: tensor})
+        rendered(scene, **{name: tensor})
 
 
 def test_a_nan_that_would_hide_its_gaussian_is_refused(scene):
@@ -45,7 +45,7 @@ def test_a_nan_that_would_hide_its_gaussian_is_refused(scene):
         tensor = getattr(scene, name).clone()
         tensor[0] = math.nan
         with pytest.raises(NotFiniteError, match=f"{name} must be finite"):
-            draw(scene, **{name: tensor})
+            rendered(scene, **{name: tensor})
 
 
 def test_harmonics_are_looked_at_as_far_as_they_are_used(scene):
@@ -61,18 +61,18 @@ def test_harmonics_are_looked_at_as_far_as_they_are_used(scene):
 def test_a_bad_camera_is_told_from_bad_gaussians(scene, name):
     bad = 1e38 if scene.means.dtype == torch.float32 else 1e200
     with pytest.raises(NotFiniteError, match=f"from finite inputs: .*{name}={re.escape(f'{bad:.3g}')}"):
-        draw(scene, camera=replace(scene.camera, **{name: bad}))
+        rendered(scene, camera=replace(scene.camera, **{name: bad}))
 
 
 def test_scales_whose_squares_overflow_are_refused(scene):
     huge = 1e21 if scene.means.dtype == torch.float32 else 1e160
     with pytest.raises(NotFiniteError, match=r"their scales go up to [0-9.]+e\+(2|15)"):
-        draw(scene, scales=huge * scene.scales)
+        rendered(scene, scales=huge * scene.scales)
 
 
 def test_a_background_that_is_not_finite_is_refused(scene):
     with pytest.raises(NotFiniteError, match=r"background must be finite, got .*nan"):
-        draw(scene, background=torch.tensor([0.0, math.nan, 1.0], device=scene.means.device))
+        rendered(scene, background=torch.tensor([0.0, math.nan, 1.0], device=scene.means.device))
 
 
 def test_a_new_background_takes_no_further_wait(card):
@@ -96,7 +96,7 @@ def test_a_background_that_is_changed_is_looked_at_again(scene):
 
 def test_a_sum_that_overflows_over_finite_numbers_is_no_mistake(scene):
     bright = torch.full_like(scene.colors, 0.9 * torch.finfo(scene.colors.dtype).max)
-    picture = draw(scene, colors=torch.where(torch.arange(40, device=bright.device)[:, None] < 36, bright, 0.0))
+    picture = rendered(scene, colors=torch.where(torch.arange(40, device=bright.device)[:, None] < 36, bright, 0.0))
     assert picture.shape == (3, 16, 24)
 
 
@@ -110,10 +110,10 @@ def test_geographic_coordinates_are_refused_in_float32_alone(case):
         with pytest.raises(
             ValueError, match=r"4.5e\+06 from the world's origin.* pixels of this view.*subtract a common"
         ):
-            draw(moved.to(case.dtype))
+            rendered(moved.to(case.dtype))
     else:
-        torch.testing.assert_close(draw(moved), draw(scene), rtol=0, atol=1e-6)
+        torch.testing.assert_close(rendered(moved), rendered(scene), rtol=0, atol=1e-6)
 
 
 def test_an_empty_view_needs_no_numbers(scene):
-    assert torch.equal(draw(scene, opacities=torch.zeros_like(scene.opacities)), torch.zeros_like(draw(scene)))
+    assert torch.equal(rendered(scene, opacities=torch.zeros_like(scene.opacities)), torch.zeros_like(rendered(scene)))

@@ -38,7 +38,7 @@ def afresh():
         ("torch", torch.float32, "torch"),
         ("auto", torch.float64, "torch"),
         ("numba", torch.float64, "torch"),
-        ("auto", torch.bfloat16, "numba"),  # is drawn in float32
+        ("auto", torch.bfloat16, "numba"),  # is rendered in float32
     ],
 )
 def test_numba_renders_float32_on_a_processor(chosen, dtype, name):
@@ -111,16 +111,16 @@ def test_the_old_name_of_an_engine_is_refused_with_the_new_one(monkeypatch):
 
 
 @pytest.mark.parametrize("chosen", [None, "auto", "torch"])
-@pytest.mark.parametrize("drawing", ["numba", "torch"])
-def test_what_was_chosen_is_chosen_again(chosen, drawing, monkeypatch):
+@pytest.mark.parametrize("engine", ["numba", "torch"])
+def test_what_was_chosen_is_chosen_again(chosen, engine, monkeypatch):
     if chosen is None:
         monkeypatch.delenv("CA_REG_ENGINE", raising=False)
     else:
         monkeypatch.setenv("CA_REG_ENGINE", chosen)
 
     def interrupted():
-        with using_engine(drawing):
-            assert describe_engine("cpu").startswith(drawing)
+        with using_engine(engine):
+            assert describe_engine("cpu").startswith(engine)
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -135,7 +135,7 @@ def test_an_engine_that_is_not_there_changes_nothing(monkeypatch):
     assert os.environ["CA_REG_ENGINE"] == "torch"
 
 
-def test_loops_draw_on_a_cpu_alone():
+def test_loops_render_on_a_cpu_alone():
     assert engines_on(torch.device("cpu")) == ("numba", "torch")
     assert engines_on(torch.device("cuda")) == (("triton", "torch") if find_spec("triton") else ("torch",))
 

@@ -96,9 +96,9 @@ if __name__ == "__main__":
     subprocess.run([sys.executable, str(script)], env=subprocess_environment(), check=True, timeout=300)
 
 
-def test_a_thread_that_outlives_the_main_one_still_draws():
+def test_a_thread_that_outlives_the_main_one_still_renders():
     pytest.importorskip("numba")
-    assert "drawn" in run(
+    assert "rendered" in run(
         DRAW
         + """
 expected = picture()
@@ -106,7 +106,7 @@ def later():
     threading.main_thread().join()
     time.sleep(0.5)
     assert picture() == expected
-    print("drawn", flush=True)
+    print("rendered", flush=True)
 threading.Thread(target=later).start()
 """
     )
@@ -132,7 +132,7 @@ print(torch.get_num_threads(), len(set(used)), describe_engine("cpu"))
     assert int(of_torch) <= int(count)
 
 
-def test_what_does_not_draw_does_not_import_numba():
+def test_what_does_not_render_does_not_import_numba():
     out = run(
         """
 import sys

@@ -96,7 +96,7 @@ def agree(random, scene):
     assert (parts - shares).norm() <= GRADIENT * shares.norm() + 1e-9
 
 
-@pytest.mark.parametrize("random", [False, True], ids=["drawn", "moments"])
+@pytest.mark.parametrize("random", [False, True], ids=["rendered", "moments"])
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(scene=scenes())
 def test_the_loops_are_the_torch_engine(random, scene):
@@ -104,7 +104,7 @@ def test_the_loops_are_the_torch_engine(random, scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("random", [False, True], ids=["drawn", "moments"])
+@pytest.mark.parametrize("random", [False, True], ids=["rendered", "moments"])
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(scene=scenes())
 def test_the_loops_are_the_torch_engine_in_many_scenes(random, scene):

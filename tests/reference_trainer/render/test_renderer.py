@@ -145,7 +145,7 @@ def test_a_dropped_gaussian_is_as_if_it_were_not_there(case):
     assert (opacities.grad[~keep] == 0).all()
 
 
-def test_a_mask_draws_what_a_fresh_render_draws(case):
+def test_a_mask_renders_what_a_fresh_render_does(case):
     scene = random_scene(150, 30, 21, seed=8, size=0.15).to(case.dtype)
     g = torch.Generator().manual_seed(4)
     whole = splat(*scene[:4], scene.camera, colors=scene.colors)
@@ -163,7 +163,7 @@ def test_a_mask_draws_what_a_fresh_render_draws(case):
         torch.testing.assert_close(opacities.grad, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_many_masks_at_once_draw_what_fresh_renders_draw(case):
+def test_several_masks_at_once_render_what_fresh_renders_do(case):
     """Dropped, lowered, all, none, and long lists in which some pictures end before others."""
     scene = random_scene(300, 37, 21, seed=9, size=0.3).to(case.dtype)
     background = torch.tensor([0.3, 0.6, 0.1], dtype=case.dtype)
@@ -204,16 +204,16 @@ def test_nothing_in_view_is_the_background(n, case):
     assert all((x.grad is None or not x.grad.any()) for x in tensors)
 
 
-def test_a_gaussian_at_the_cut_is_drawn_at_its_center_or_not_at_all(case):
+def test_a_gaussian_at_the_cut_is_rendered_at_its_center_or_not_at_all(case):
     """An alpha of exactly 1/255 may fall to either side, and to no third one."""
     camera = Camera(torch.eye(4), 10.0, 10.0, 4.5, 4.5, 9, 9)
     for factor, seen in ((1.0, None), (1.001, True), (0.999, False)):
         opacity = torch.tensor([factor / 255], dtype=case.dtype)
         out = render(torch.tensor([[0.0, 0, 2]], dtype=case.dtype), torch.tensor([[1.0, 0, 0, 0]], dtype=case.dtype),
                      torch.full((1, 3), 0.01, dtype=case.dtype), opacity, camera, colors=torch.ones(1, 3))  # fmt: skip
-        drawn = out.alpha > 0
-        assert drawn.sum() == int(drawn[4, 4])
-        assert seen is None or bool(drawn[4, 4]) == seen
+        covered = out.alpha > 0
+        assert covered.sum() == int(covered[4, 4])
+        assert seen is None or bool(covered[4, 4]) == seen
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def test_the_number_of_threads_changes_no_bit(seed):
         assert all(torch.equal(x, y) for x, y in zip(results[0], other, strict=True))
 
 
-def test_several_threads_draw_at_once():
+def test_several_threads_render_at_once():
     torch.set_num_threads(2)
     scenes = [random_scene(1500, 101, 67, seed=seed, size=0.05).to(torch.float32) for seed in range(4)]
     alone = [everything(scene) for scene in scenes]

@@ -49,8 +49,8 @@ def rendered(renderer, scene, **options):
 def counted(out, camera):
     """What the trainer enters into the densification statistics."""
     statistics = DensityStatistics.zeros(N, out.image.device)
-    indices, drawn, gradient = out.splats.indices, out.splats.touched, out.splats.means.grad
-    statistics.update(indices, drawn, gradient, camera.width, camera.height)
+    indices, touched, gradient = out.splats.indices, out.splats.touched, out.splats.means.grad
+    statistics.update(indices, touched, gradient, camera.width, camera.height)
     return statistics
 
 
@@ -66,7 +66,7 @@ def compare(one, other, camera, **close):
     seen = mine.steps > 0
     assert 20 < seen.sum() < N
     assert (its.steps[seen] == 1).all()
-    # gsplat's lists are rectangles: they also hold what touches the picture's tiles, but draws nothing there.
+    # gsplat's lists are rectangles: they also hold what touches the picture's tiles, but renders nothing there.
     assert not its.gradient_sum[(its.steps > 0) & ~seen].any()
 
 
@@ -156,11 +156,11 @@ def test_wrong_arguments_are_told():
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("options", [{}, {"depth": True}], ids=["image", "depth"])
-def test_gsplat_itself_draws_the_same(options):
+def test_gsplat_itself_renders_the_same(options):
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     pytest.importorskip("gsplat", exc_type=ImportError)
     scene = scene_of("cuda")
     ours, theirs = (rendered(renderer, scene, **options) for renderer in (render, load_gsplat_render("cuda")))
-    # A pair on the edge of 1/255 may be drawn by one and not by the other.
+    # A pair on the edge of 1/255 may be rendered by one and not by the other.
     compare(ours, theirs, scene.camera, rtol=1e-2, atol=5e-3)

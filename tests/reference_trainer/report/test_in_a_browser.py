@@ -72,8 +72,8 @@ def shown(page: Page, script: str) -> list[np.ndarray]:
     return pictures
 
 
-def assert_drawn(picture: np.ndarray, model: TrainedModel, view: View) -> None:
-    """A browser's picture is what the renderer draws, but for the roundings: every blend is rounded to 8 bits."""
+def assert_rendered(picture: np.ndarray, model: TrainedModel, view: View) -> None:
+    """A browser's picture is what the renderer renders, but for the roundings: every blend is rounded to 8 bits."""
     expected = model.test_rendering(view).image.clamp(0, 1).numpy()
     assert expected.mean() > 0.1
     error = np.abs(picture - expected) * 255
@@ -83,13 +83,13 @@ def assert_drawn(picture: np.ndarray, model: TrainedModel, view: View) -> None:
 
 @pytest.mark.slow
 @needs_browser
-def test_a_browser_shows_what_the_renderer_draws(turned, opened):
+def test_a_browser_shows_what_the_renderer_renders(turned, opened):
     runs, _ = turned
     found = [load_run_model(run) for run in runs]
     for number, view in enumerate(two_of_each(found[0][1])):
         drawn = shown(opened, f"$('from').value = {number}; $('from').onchange()")
         for (model, _), picture in zip(found, drawn, strict=True):
-            assert_drawn(picture, model, view)
+            assert_rendered(picture, model, view)
 
 
 @pytest.mark.slow
@@ -107,7 +107,7 @@ def test_a_browser_shows_the_heat_and_hides_what_co_adapts_most(turned, opened):
             kept = values.argsort().argsort() < len(values) - len(values) * hidden // 100
             assert int(kept.sum()) == pytest.approx((1 - hidden / 100) * len(values), abs=1)
             heat = colored_by(model.gaussians, values, low, high)[kept]
-            assert_drawn(picture, dataclasses.replace(model, gaussians=heat), views[0])
+            assert_rendered(picture, dataclasses.replace(model, gaussians=heat), views[0])
             assert np.abs(picture - color).mean() > 0.1
     text = opened.run("document.getElementById('models').textContent")
     assert f"{100 * data['runs'][1]['held'][30]:.1f} % of the co-adaptation" in text

@@ -222,7 +222,7 @@ def test_a_damaged_log_is_told_from_none(tmp_path):
 
 
 @pytest.mark.slow
-def test_opacities_that_depend_on_the_camera_are_drawn_plain(tmp_path, options, short):
+def test_opacities_that_depend_on_the_camera_are_rendered_plain(tmp_path, options, short):
     config = dataclasses.replace(short, initial_opacity=0.9, regularizer="depth(0.4, scale=True)")
     trainer = unfinished(tmp_path, options, config)
     page = Parsed(write_report([tmp_path], views=1))
@@ -249,7 +249,7 @@ def test_what_is_no_run_or_no_pair_is_refused(run, found, tmp_path, monkeypatch)
 
 
 def strategies(found, folders, tmp_path, monkeypatch) -> dict:
-    """The data of a page about runs that all are drawn as one."""
+    """The data of a page about runs that all are plotted as one."""
     monkeypatch.setattr(page_module, "find", lambda _, label, **__: dataclasses.replace(found, label=label))
     return Parsed(write_report(folders, tmp_path / "page.html")).data
 

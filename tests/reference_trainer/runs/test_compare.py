@@ -369,7 +369,7 @@ def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_
 
 
 @pytest.mark.parametrize("chosen", ["torch", "auto"])
-def test_a_worker_draws_with_the_engine_of_the_sweep(chosen, tmp_path, options, short, monkeypatch):
+def test_a_worker_renders_with_the_engine_of_the_sweep(chosen, tmp_path, options, short, monkeypatch):
     """Also where it does not inherit the environment, as on another machine."""
     monkeypatch.setenv("CA_REG_ENGINE", chosen)
     train = grid.train_run

@@ -159,7 +159,7 @@ def test_the_table_has_one_row_per_view_and_the_means():
 
 
 @pytest.mark.parametrize(("what", "names"), [("test", ["test_0", "test_1", "test_outside"]), ("train", None)])
-def test_views_are_rendered_as_the_run_drew_them(run, what, names):
+def test_views_are_rendered_as_in_the_run(run, what, names):
     out, _ = run
     folder = render_run(out, what)
     assert folder == out / f"render_{what}"

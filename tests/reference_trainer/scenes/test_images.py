@@ -7,11 +7,11 @@ from PIL import Image
 
 from reference_trainer.scenes.images import (
     composite,
+    image_folder,
     image_size,
     list_images,
     match_images,
     path_inside,
-    picture_folder,
     read_image,
     resize_image,
 )
@@ -129,16 +129,16 @@ def test_of_the_folders_with_pictures_the_first_of_usable_size_is_taken(tmp_path
     (tmp_path / "images_2").mkdir()
     (tmp_path / "images_2" / "notes.txt").touch()
     save(tmp_path / "images", 1000, 501)
-    assert picture_folder(tmp_path, None) == tmp_path / "images"  # for want of a smaller one
+    assert image_folder(tmp_path, None) == tmp_path / "images"  # for want of a smaller one
     save(tmp_path / "images_4", 1000, 500)
     touch(tmp_path / "images_8", "damaged.png")  # it is not opened
-    assert picture_folder(tmp_path, None) == tmp_path / "images_4"
-    assert picture_folder(tmp_path, "images_2") == tmp_path / "images_2"
+    assert image_folder(tmp_path, None) == tmp_path / "images_4"
+    assert image_folder(tmp_path, "images_2") == tmp_path / "images_2"
 
 
 def test_pictures_in_subfolders_are_left_to_what_names_them(tmp_path):
     touch(tmp_path / "images" / "left", "a.png")
-    assert picture_folder(tmp_path, None) == tmp_path / "images"
+    assert image_folder(tmp_path, None) == tmp_path / "images"
 
 
 @pytest.mark.parametrize("path", ["../secret.png", "/etc/passwd", "a/../../b", "..", "./../x"])

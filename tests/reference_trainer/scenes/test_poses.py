@@ -180,7 +180,7 @@ def test_photographs_that_cannot_be_read_are_left_out_and_all_are_named(noise, t
 def test_what_only_colmap_cannot_read_is_left_out_too(noise, monkeypatch):
     pycolmap = pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
     Image.new("RGB", (40, 30)).save(noise / "3.webp")
-    for step in ("_watched", "_adjust", "_reduce"):
+    for step in ("_with_progress", "_adjust", "_reduce"):
         monkeypatch.setattr(poses, step, lambda *_, **__: None)
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, **__: {0: reconstruction()})
     said = str(find_poses(noise))

@@ -199,19 +199,19 @@ def test_views_without_a_score_are_refused(scene):
         error_runtime(TrainedModel(black, torch.zeros(3)), view)
 
 
-def test_every_engine_draws_its_own_moments(scene, monkeypatch):
-    drawn = Counter()
+def test_every_engine_renders_its_own_moments(scene, monkeypatch):
+    rendered = Counter()
     render_moments = model_module.render_moments
 
     def spy(splats, *rest, **keywords):
-        drawn[splats.engine.name, splats.colors.dtype] += 1
+        rendered[splats.engine.name, splats.colors.dtype] += 1
         return render_moments(splats, *rest, **keywords)
 
     monkeypatch.setattr(model_module, "render_moments", spy)
     measured = error_runtime(*scene, max_samples=16, seeds=1)
     rounds = len(measured["render_seconds"]) + 2  # the maps, and a round that is not timed
-    assert drawn[LOOPS.removeprefix("exact, "), torch.float32] == rounds
-    assert drawn[TORCH.removeprefix("exact, "), torch.float32] == rounds
+    assert rendered[LOOPS.removeprefix("exact, "), torch.float32] == rounds
+    assert rendered[TORCH.removeprefix("exact, "), torch.float32] == rounds
 
 
 def test_where_there_are_no_loops_torch_alone_is_measured(scene, monkeypatch):
@@ -241,9 +241,9 @@ def run(tmp_path_factory, options, short):
 
 @pytest.mark.slow
 def test_runs_and_ply_files_are_sources(run, ball, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "PICTURE", 24)
+    monkeypatch.setattr(module, "IMAGE_SIDE", 24)
     study = error_runtime_study([run, ball], max_samples=16, seeds=1)
-    results = run_study(study, tmp_path / "out", say=lambda text: None)
+    results = run_study(study, tmp_path / "out")
     assert list(results) == ["scene/strategy/seed_0", "ball"]
     model, scene = load_run_model(run)
     exact = model.exact_ca_score(drop_rate=0.5)(model.gaussians.opacities, scene.test[0])
@@ -270,7 +270,7 @@ def test_sources_that_cannot_be_told_apart_or_are_scaled_are_refused(ball, tmp_p
     ):
         save_ply(gaussians, tmp_path / "baked.ply", **keywords)
         with pytest.raises(ValueError, match=f"baked.ply are {by}"):
-            run_study(error_runtime_study([tmp_path / "baked.ply"]), tmp_path / "out", say=lambda text: None)
+            run_study(error_runtime_study([tmp_path / "baked.ply"]), tmp_path / "out")
     with pytest.raises(ValueError, match="at least 1 run"):
         error_runtime_study([])
 
@@ -298,9 +298,9 @@ def test_the_table_holds_medians_and_root_mean_squares():
 
 
 @pytest.mark.slow
-def test_the_figure_can_be_drawn_without_an_error_of_the_exact_estimate(tmp_path):
+def test_the_figure_can_be_plotted_without_an_error_of_the_exact_estimate(tmp_path):
     figure = Figure(layout="constrained")
-    module._draw({"a": known(5e-4), "b": known(0.0), "c": known(1e-6)}, figure)
+    module._plot({"a": known(5e-4), "b": known(0.0), "c": known(1e-6)}, figure)
     figure.savefig(tmp_path / "f.png")
     with Image.open(tmp_path / "f.png") as picture:
         assert picture.width > picture.height

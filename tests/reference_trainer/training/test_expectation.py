@@ -64,7 +64,7 @@ def one_white(opacity: float) -> tuple[Gaussians, Camera]:
     return white.map(lambda x: x.double()), Camera(torch.eye(4), 6.0, 6.0, 2.5, 2.5, 5, 5)
 
 
-def test_opaque_gaussians_are_drawn_more_opaque_at_test_time_than_inverted_dropout_trains_them():
+def test_opaque_gaussians_are_rendered_more_opaque_at_test_time_than_inverted_dropout_trains_them():
     """As docs/theory.md says; plain dropout has no such gap."""
     white, camera = one_white(0.95)
     for compensate, trained, drawn in ((True, 0.495, 0.95), (False, 0.475, 0.475)):

@@ -42,7 +42,7 @@ def test_sizes_are_the_distance_to_the_neighbors_times_the_scale(tiny_scene):
     torch.testing.assert_close(half.means, whole.means)
 
 
-def test_a_gaussian_is_drawn_where_its_footprint_reaches_the_picture():
+def test_a_gaussian_is_rendered_where_its_footprint_reaches_the_picture():
     """At depth 10 the right edge of the picture is at x = 8; a standard deviation of 1 reaches 2.5 further at 0.1."""
     means = torch.tensor([[0.0, 0.0, 10.0], [9.0, 0.0, 10.0], [40.0, 0.0, 10.0], [0.0, 0.0, -10.0]])
     gaussians = Gaussians.from_points(means, torch.rand(4, 3), torch.ones(4), sh_degree=0)
@@ -50,8 +50,8 @@ def test_a_gaussian_is_drawn_where_its_footprint_reaches_the_picture():
     assert seen_by_any(gaussians, (view,)).tolist() == [True, True, False, False]
 
 
-def test_what_is_seen_is_drawn_where_it_is_asked_for(tiny_scene, monkeypatch):
-    """On a card the CPU draws nothing, for which its loops would have to be compiled."""
+def test_what_is_seen_is_rendered_where_it_is_asked_for(tiny_scene, monkeypatch):
+    """On a card the CPU renders nothing, for which its loops would have to be compiled."""
     devices, original = [], model_state.splat
 
     def splat(means, **given):
@@ -71,8 +71,8 @@ def test_what_is_seen_is_drawn_where_it_is_asked_for(tiny_scene, monkeypatch):
 def test_unseen_points_change_nothing_at_the_training_views(tiny_scene):
     """Without draws, which depend on the number of Gaussians, training is the same but for rounding."""
     scene = with_points(tiny_scene, BEHIND.repeat(3, 1) + torch.arange(3.0)[:, None])
-    drawn = seen_by_any(initial_gaussians(scene, TrainConfig()), scene.train)
-    assert torch.nonzero(~drawn).flatten().tolist() == [150, 151, 152]
+    visible = seen_by_any(initial_gaussians(scene, TrainConfig()), scene.train)
+    assert torch.nonzero(~visible).flatten().tolist() == [150, 151, 152]
     config = TrainConfig(iterations=6, sh_every=2, densify_every=0, opacity_reset_from=3)
     everything, seen = (Trainer(scene, dataclasses.replace(config, initial_points=which)) for which in ("all", "seen"))
     everything.train()
@@ -138,7 +138,7 @@ def test_models_start_alike_and_draw_on_their_own(tiny_scene):
 
 
 @pytest.mark.slow
-def test_a_training_of_two_fields_is_resumed_to_the_identical_result(tiny_scene, busy, tmp_path):
+def test_a_training_of_two_models_is_resumed_to_the_identical_result(tiny_scene, busy, tmp_path):
     loss = "photometric + co_regularization(between(1.0, 4))"
     config = dataclasses.replace(busy, iterations=16, loss=loss, density=SEGS, models=2, regularizer="concrete")
     whole = trained(tiny_scene, config)
@@ -170,7 +170,7 @@ def test_a_training_of_two_fields_is_resumed_to_the_identical_result(tiny_scene,
         (lambda s: s["statistics"].pop("pictures"), "statistics: it lacks 'pictures'"),
     ],
 )
-def test_a_damaged_second_field_is_refused(tiny_scene, tmp_path, change, said):
+def test_a_damaged_second_model_is_refused(tiny_scene, tmp_path, change, said):
     path = tmp_path / "checkpoint.pt"
     Trainer(tiny_scene, TrainConfig(iterations=30, density=SEGS, models=2)).save(path)
     state = load_checkpoint(path)
@@ -181,7 +181,7 @@ def test_a_damaged_second_field_is_refused(tiny_scene, tmp_path, change, said):
 
 
 @pytest.mark.parametrize("settings", [{"loss": "photometric + co_regularization"}, {"density": "co_pruning"}])
-def test_what_compares_fields_needs_two(settings):
+def test_what_compares_models_needs_two(settings):
     with pytest.raises(ValueError, match="compares models, of which there is one: set models=2"):
         check(TrainConfig(**settings))
     check(TrainConfig(**settings, models=2))
@@ -189,7 +189,7 @@ def test_what_compares_fields_needs_two(settings):
         TrainConfig(models=0)
 
 
-def test_all_fields_train_over_one_random_background(tiny_scene):
+def test_all_models_train_over_one_random_background(tiny_scene):
     trainer = Trainer(tiny_scene, TrainConfig(iterations=9, models=2, random_background=True))
     colors = []
     for _ in range(3):

@@ -160,7 +160,7 @@ def test_bands_begin_with_the_iteration_of_the_code_base(scene, monkeypatch, nam
         trainer.step = iteration - 1
         trainer.train_step()
         assert trainer.sh_degree == used[-1]
-    assert used == [degree for degree in expected for _ in range(len(used) // len(near))]  # mvgs draws three views
+    assert used == [degree for degree in expected for _ in range(len(used) // len(near))]  # mvgs renders three views
 
 
 @pytest.mark.parametrize("name", RECIPES)

@@ -33,18 +33,18 @@ def model():
     return TrainedModel(replace(gaussians, opacity_logits=logits), torch.rand(3, generator=generator), "dropout(0.2)")
 
 
-def drawn_with(model, opacities, camera=CAMERA):
+def rendered_with(model, opacities, camera=CAMERA):
     return render_gaussians(model.gaussians, camera, model.background, opacities=opacities).image.clamp(0, 1)
 
 
 def test_a_render_is_that_of_the_test(model):
     image, note, _ = ViewerModel(model, []).render(DisplayOptions(), CAMERA)
-    torch.testing.assert_close(image, drawn_with(model, 0.8 * model.gaussians.opacities))
+    torch.testing.assert_close(image, rendered_with(model, 0.8 * model.gaussians.opacities))
     assert note == ""
 
 
 def test_the_expected_error_is_told_by_the_training_photographs(model):
-    photograph = View("v", CAMERA, drawn_with(model, 0.5 * model.gaussians.opacities))
+    photograph = View("v", CAMERA, rendered_with(model, 0.5 * model.gaussians.opacities))
     shown = ViewerModel(model, [Viewpoint("", CAMERA)], train=[photograph])
     image, note, scale = shown.render(DisplayOptions("expected error"), CAMERA)
     found = ErrorMaps(model, [photograph])(Viewpoint("", CAMERA))
@@ -93,9 +93,9 @@ def test_a_mask_stays_while_somebody_turns_and_grows_with_the_rate(model):
         keep = shown._chosen_last[1].gaussians.opacities > 0
         # 400 draws: beyond 5 standard deviations with a probability below 1e-6; the seed is fixed
         assert abs(keep.float().mean().item() - (1 - rate)) < 5 * math.sqrt(rate * (1 - rate) / 400)
-        torch.testing.assert_close(image, drawn_with(model, plain * keep))
+        torch.testing.assert_close(image, rendered_with(model, plain * keep))
         beside, *_ = shown.render(DisplayOptions(drop_rate=rate, mask=True), BESIDE)
-        torch.testing.assert_close(beside, drawn_with(model, plain * keep, BESIDE))
+        torch.testing.assert_close(beside, rendered_with(model, plain * keep, BESIDE))
         kept.append(keep)
     assert bool((kept[1] <= kept[0]).all())
 
@@ -118,7 +118,7 @@ def test_those_that_co_adapt_most_are_hidden(model):
     stay = values <= values.sort().values[299]
     assert stay.sum() == 300
     image, note, _ = ViewerModel(model, views).render(DisplayOptions(hidden=0.25), CAMERA)
-    torch.testing.assert_close(image, drawn_with(model, 0.8 * model.gaussians.opacities * stay))
+    torch.testing.assert_close(image, rendered_with(model, 0.8 * model.gaussians.opacities * stay))
     assert note == f"{shares[~stay].sum() / shares.sum():.0%} of the exact CA are hidden"
 
 

@@ -92,7 +92,7 @@ def test_a_picture_is_rough_while_somebody_moves_and_full_afterwards(run, viewer
 
 @pytest.fixture
 def page(run, viewer):
-    """A page at the first training camera, its picture drawn in full."""
+    """A page at the first training camera, its picture rendered in full."""
     model, scene = load_run_model(run[0])
     viewer.show(model, measured_views(scene), "mine")
     client = Client(scene.train[0].camera)
@@ -179,8 +179,8 @@ def test_a_flight_along_added_cameras_is_a_movie(run, viewer, page, monkeypatch)
 def test_a_flight_of_two_models_has_pictures_of_one_size_whatever_their_notes(run, viewer, page, monkeypatch):
     monkeypatch.setattr(window, "MOVIE_FRAMES", 4)
     monkeypatch.setitem(sys.modules, "av", None)  # a WebP, which cannot be of several sizes
-    drawn, lengths = ViewerModel.render, cycle(range(9))
-    monkeypatch.setattr(ViewerModel, "render", lambda *of: drawn(*of)._replace(note="9" * next(lengths)))
+    rendered, lengths = ViewerModel.render, cycle(range(9))
+    monkeypatch.setattr(ViewerModel, "render", lambda *of: rendered(*of)._replace(note="9" * next(lengths)))
     model, scene = load_run_model(run[0])
     viewer.show(model, measured_views(scene), "other")
     for view in scene.train[:2]:
@@ -259,7 +259,7 @@ def test_a_training_that_nobody_looks_at_is_left_alone(viewer):
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium, such as Debian's package chromium")
-def test_a_browser_shows_what_was_drawn(run, viewer):
+def test_a_browser_shows_what_was_rendered(run, viewer):
     model, scene = load_run_model(run[0])
     viewer.show(model, measured_views(scene))
 

@@ -68,7 +68,7 @@ def test_a_task_that_kills_every_worker_is_given_up(retries):
     assert executor.started.count(0) == retries + 1
 
 
-def test_the_engine_is_closed_when_nobody_asks_any_more():
+def test_the_executor_is_closed_when_nobody_asks_any_more():
     executor = Told(1, {number: [Value(number)] for number in range(5)})
     outcomes = run_all(executor, tasks(5))
     next(outcomes)
@@ -77,7 +77,7 @@ def test_the_engine_is_closed_when_nobody_asks_any_more():
     assert executor.started == [0]
 
 
-def test_the_engine_is_closed_on_an_interruption():
+def test_the_executor_is_closed_on_an_interruption():
     executor = Told(1, {0: []})
     executor.wait = lambda: (_ for _ in ()).throw(KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):

@@ -25,12 +25,12 @@ def spoiled(x, bad):
     return x
 
 
-def drawn(**changes):
+def rendered(**changes):
     return scene_quantities(dataclasses.replace(SCENE, **changes), torch.float32)
 
 
 def with_camera(**changes):
-    return drawn(camera=dataclasses.replace(SCENE.camera, **changes))
+    return rendered(camera=dataclasses.replace(SCENE.camera, **changes))
 
 
 def with_harmonics(bad):
@@ -46,8 +46,8 @@ def moments_over(bad):
 
 
 RENDERER = {
-    **{name: lambda bad, name=name: drawn(**{name: spoiled(getattr(SCENE, name), bad)}) for name in PARAMETERS},
-    "background": lambda bad: drawn(background=spoiled(SCENE.background, bad)),
+    **{name: lambda bad, name=name: rendered(**{name: spoiled(getattr(SCENE, name), bad)}) for name in PARAMETERS},
+    "background": lambda bad: rendered(background=spoiled(SCENE.background, bad)),
     **{f"camera.{name}": lambda bad, name=name: with_camera(**{name: bad}) for name in ("fx", "fy", "cx", "cy")},
     "world_to_camera": lambda bad: with_camera(world_to_camera=spoiled(SCENE.camera.world_to_camera, bad)),
     "sh": with_harmonics,

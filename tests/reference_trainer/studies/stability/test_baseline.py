@@ -14,9 +14,9 @@ def test_values_and_gradients_are_those_of_brute_force(size):
     scene = random_scene(60, 37, 21, 3, size=size)
     weights = torch.rand(3, 21, 37, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     results = []
-    for draw in (render_simply, lambda *x: brute_force(*x)[0]):
+    for render_fn in (render_simply, lambda *x: brute_force(*x)[0]):
         leaves = [x.clone().requires_grad_() for x in scene.tensors()]
-        image = draw(*leaves, scene.camera)
+        image = render_fn(*leaves, scene.camera)
         results.append((image.detach(), *torch.autograd.grad((image * weights).sum(), leaves)))
     for found, true in zip(*results, strict=True):
         assert float(true.abs().max()) > 0

@@ -63,17 +63,17 @@ def needles(ratio):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ratio", [2.0, 1e2, 1e4, 1e6, 1e8])
-def test_long_needles_are_drawn_right_where_float64_itself_is_in_doubt(ratio):
+def test_long_needles_are_rendered_right_where_float64_itself_is_in_doubt(ratio):
     """The stability study compares needles with the renderer in float64: the reference of the other cases ends here."""
     scene = needles(ratio)
     exact = exact_images(scene)
-    drawn = {"float64": scene_quantities(scene, torch.float64)}
+    rendered = {"float64": scene_quantities(scene, torch.float64)}
     if ratio <= 1e6:  # then its covariances of 1e16 and 0.3 leave float64 nothing to invert
-        drawn["reference"] = independent_images(scene)
+        rendered["reference"] = independent_images(scene)
     for engine in engines_on(torch.device("cpu")):
         with using_engine(engine):
-            drawn[engine] = scene_quantities(scene, torch.float32)
-    for by, quantities in drawn.items():
+            rendered[engine] = scene_quantities(scene, torch.float32)
+    for by, quantities in rendered.items():
         for name in IMAGES:
             tolerance = GRADIENT_TOLERANCE if name.startswith("d ") else VALUE_TOLERANCE
             assert relative_error(quantities[name], exact[name]) <= tolerance, (by, name)

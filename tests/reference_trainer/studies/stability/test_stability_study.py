@@ -37,27 +37,27 @@ def made_up(monkeypatch):
     return use
 
 
-def test_what_draws_is_judged_with_every_engine_against_one_reference(made_up):
-    drawn, references = [], []
+def test_what_renders_is_judged_with_every_engine_against_one_reference(made_up):
+    rendered, references = [], []
 
     def measured():
-        drawn.append(splats_of(base_scene(3).to(torch.float32)).engine.name)
+        rendered.append(splats_of(base_scene(3).to(torch.float32)).engine.name)
         return {"image": torch.ones(2)}
 
     def reference():
         references.append(1)
         return {"image": torch.ones(2).double()}
 
-    made_up(Case("f", "n", lambda magnitude: Probe(measured, reference)), Case("f", "m", grows, draws=False))
+    made_up(Case("f", "n", lambda magnitude: Probe(measured, reference)), Case("f", "m", grows, renders=False))
     records = [judge_with(**settings) for settings in stability_study().cases.values()]
-    assert [record["engine"] for record in records] == [*drawn, None] == ["numba", "torch", None]
+    assert [record["engine"] for record in records] == [*rendered, None] == ["numba", "torch", None]
     assert len(references) == 1
 
 
-def test_cases_that_say_that_they_draw_nothing_draw_nothing(monkeypatch):
-    quick = [case for case in all_cases() if not case.draws and not any(part in case.name for part in SLOW)]
+def test_cases_that_say_that_they_render_nothing_render_nothing(monkeypatch):
+    quick = [case for case in all_cases() if not case.renders and not any(part in case.name for part in SLOW)]
     assert len(quick) >= 3
-    monkeypatch.setattr(renderer, "engine_for", lambda device, dtype: pytest.fail(f"drew {dtype}"))
+    monkeypatch.setattr(renderer, "engine_for", lambda device, dtype: pytest.fail(f"rendered {dtype}"))
     for case in quick:
         judge(case)
 
@@ -84,19 +84,19 @@ def refuses():
 
 MADE_UP = [
     Case("first", "grows", grows, decades(0, 4), until=100.0, note="by design"),
-    single("second", "refuses", refuses, refused="itself", draws=False),
-    single("second", "is right", lambda: grows(1.0), draws=False),
+    single("second", "refuses", refuses, refused="itself", renders=False),
+    single("second", "is right", lambda: grows(1.0), renders=False),
 ]
 
 
-def test_numbers_tables_and_picture(made_up, tmp_path, capsys):
+def test_numbers_tables_and_picture(made_up, tmp_path, said):
     made_up(*MADE_UP)
     records = study_stability(tmp_path)
     assert [(case["engine"], case["ending"]) for case in records.values()] == [
         ("numba", "limit"), ("torch", "limit"), (None, "refused"), (None, "ok")
     ]  # fmt: skip
     text = (tmp_path / "stability.md").read_text()
-    assert text in capsys.readouterr().out
+    assert text in said
     assert "22 magnitudes" in text  # 2 (5 + 5) + 2
     rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in text.splitlines()]
     for engine in ("numba", "torch"):
@@ -112,7 +112,7 @@ def test_numbers_tables_and_picture(made_up, tmp_path, capsys):
 
 def test_a_defect_fails_after_everything_is_written(made_up, tmp_path):
     nan = Probe(lambda: {"image": torch.tensor([math.nan])}, lambda: {"image": torch.ones(1).double()})
-    made_up(*MADE_UP, single("third", "gives nan", lambda: nan, draws=False))
+    made_up(*MADE_UP, single("third", "gives nan", lambda: nan, renders=False))
     with pytest.raises(RuntimeError, match="1 cases do not end as they should:\n  third: gives nan"):
         study_stability(tmp_path)
     assert {path.name[10:] for path in tmp_path.glob("stability.*")} == {"json", "md", "png"}

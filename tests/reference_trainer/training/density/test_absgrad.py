@@ -36,7 +36,7 @@ def test_absgrad_clones_by_the_signed_and_splits_by_the_absolute_gradient(tiny_s
     assert len(new) == 6
 
 
-def test_absgrad_counts_sums_of_absolute_values_of_what_was_drawn(tiny_scene):
+def test_absgrad_counts_sums_of_absolute_values_of_what_was_rendered(tiny_scene):
     """Each of three steps against the two gradients computed from the splats alone; half are dropped."""
     config = TrainConfig(
         iterations=9, density="absgrad", dropout=0.5, densify_every=0, opacity_reset_every=0, loss="photometric(0.0)"

@@ -179,7 +179,7 @@ def test_extreme_opacities_stay_finite_under_decay_and_reset(logit):
 # Statistics
 
 
-def test_gradients_are_counted_in_half_image_sizes_and_averaged_over_the_steps_that_drew_them():
+def test_gradients_are_counted_in_half_image_sizes_and_averaged_over_the_steps_that_rendered_them():
     statistics = DensityStatistics.zeros(3)
     gradient = torch.tensor([[3e-2, 0.0], [0.0, 4e-2]])
     statistics.update(torch.tensor([0, 2]), torch.tensor([True, True]), gradient, width=200, height=50)
@@ -190,7 +190,7 @@ def test_gradients_are_counted_in_half_image_sizes_and_averaged_over_the_steps_t
 
 
 def seen_in(scene, gaussians: Gaussians, view, opacities) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Render with gradients as the trainer does; return indices, which of them were drawn, and gradients."""
+    """Render with gradients as the trainer does; return indices, which of them were rendered, and gradients."""
     gaussians = gaussians.map(lambda x: x.detach().clone().requires_grad_())
     rendering = render_gaussians(gaussians, view.camera, scene.background, opacities=opacities)
     (rendering.image - view.image).square().sum().backward()
@@ -217,12 +217,12 @@ def test_many_gaussians_are_counted_with_their_absolute_gradients(scale):
     for _ in range(3):
         index = torch.randperm(700, generator=g)[:600].sort().values
         rows = scale * torch.randn(600, 16, generator=g)
-        drawn = torch.rand(600, generator=g) < 0.7
+        rendered = torch.rand(600, generator=g) < 0.7
         # As a part of what the backward pass leaves: its rows have further columns.
-        statistics.update(index, drawn, rows[:, :2], 200, 100, rows[:, 3:5].abs())
+        statistics.update(index, rendered, rows[:, :2], 200, 100, rows[:, 3:5].abs())
         for row, x in ((0, rows[:, :2]), (2, rows[:, 3:5])):
             expected[row, index] += (x.double() * torch.tensor([100.0, 50.0])).square().sum(1).sqrt()
-        expected[1, index] += drawn.double()
+        expected[1, index] += rendered.double()
     found = statistics.gradient_sum, statistics.steps, statistics.absolute_sum
     torch.testing.assert_close(torch.stack(found).double(), expected, rtol=1e-5, atol=0)
 
@@ -238,8 +238,8 @@ def test_dropped_gaussians_leave_no_trace(tiny_scene):
         where = keep.nonzero().squeeze(1)
         size = (view.camera.width, view.camera.height)
         with_dropped.update(*seen_in(tiny_scene, model, view, model.opacities * keep), *size)
-        index, drawn, gradient = seen_in(tiny_scene, model[keep], view, None)
-        expected.update(where[index[drawn]], drawn[drawn], gradient[drawn], *size)
+        index, rendered, gradient = seen_in(tiny_scene, model[keep], view, None)
+        expected.update(where[index[rendered]], rendered[rendered], gradient[rendered], *size)
     assert torch.equal(with_dropped.steps, expected.steps)
     torch.testing.assert_close(with_dropped.gradient_sum, expected.gradient_sum, rtol=1e-4, atol=1e-7)
     assert int((with_dropped.steps == 0).sum()) > 0
@@ -247,7 +247,7 @@ def test_dropped_gaussians_leave_no_trace(tiny_scene):
 
 
 def test_dropout_does_not_dilute_the_mean_gradient():
-    """With the same gradient whenever it is drawn, the mean is that gradient, however often it was dropped."""
+    """With the same gradient whenever it is rendered, the mean is that gradient, however often it was dropped."""
     statistics = DensityStatistics.zeros(50)
     g = torch.Generator().manual_seed(0)
     for _ in range(40):

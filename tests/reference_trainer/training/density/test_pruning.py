@@ -46,7 +46,7 @@ def test_co_pruning_removes_what_has_no_counterpart(tiny_scene):
         assert torch.equal(model.density.statistics.steps, counted[k][torch.from_numpy(keep)])
 
 
-def test_a_field_that_would_be_empty_stops_the_training(tiny_scene):
+def test_a_model_that_would_be_empty_stops_the_training(tiny_scene):
     trainer = two(tiny_scene, "co_pruning(0.4, every=5)", densify_from=0)
     with torch.no_grad():
         trainer.models[1].gaussians.means.add_(100)
@@ -96,7 +96,7 @@ def literal_chosen(gaussians, cameras, uncertain: np.ndarray) -> np.ndarray:
     return chosen
 
 
-def test_self_ensembling_perturbs_the_second_field_where_the_first_changes(tiny_scene):
+def test_self_ensembling_perturbs_the_second_model_where_the_first_changes(tiny_scene):
     trainer = two(tiny_scene, "self_ensembling(100.0, 5, start=10, stop=30, views=3, share=0.02)", seed=4)
     strategy, (first, second) = trainer.density, trainer.models
     g, pictures = torch.Generator().manual_seed(0), []

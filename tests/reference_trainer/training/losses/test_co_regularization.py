@@ -31,7 +31,7 @@ def joined(*steps):
 
 
 @pytest.mark.parametrize("count", [2, 3])
-def test_each_field_is_compared_with_the_mean_of_the_others(scene, six, take_step, count):
+def test_each_model_is_compared_with_the_mean_of_the_others(scene, six, take_step, count):
     (term,) = LOSSES.make("co_regularization(0.6, lambda_dssim=0.3)")
     term.begin(scene)
     steps = joined(*(take_step(sh_dc=six.sh_dc + i * BRIGHTER) for i in range(count)))
@@ -48,7 +48,7 @@ def test_each_field_is_compared_with_the_mean_of_the_others(scene, six, take_ste
     assert not any(camera is observed for step in steps for _, observed in step.observed)
 
 
-def test_every_field_learns_as_if_the_other_were_a_photograph(scene, six, take_step):
+def test_every_model_learns_as_if_the_other_were_a_photograph(scene, six, take_step):
     """The loss is symmetric, so what a model is given is half of the derivative of the value."""
     (term,) = LOSSES.make("co_regularization")
     term.begin(scene)
@@ -67,7 +67,7 @@ def test_every_field_learns_as_if_the_other_were_a_photograph(scene, six, take_s
         assert (gradient * direction).sum().item() == pytest.approx(slope / 2, rel=1e-5)
 
 
-def test_a_step_costs_one_more_render_of_every_field(tiny_scene):
+def test_a_step_costs_one_more_render_of_every_model(tiny_scene):
     class Counting:
         capabilities, count = frozenset[str](), 0
 

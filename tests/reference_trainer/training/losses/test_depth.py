@@ -181,7 +181,7 @@ def test_nothing_to_compare_is_no_error(take_step):
     step.view = dataclasses.replace(step.view, depth_prior=blank)
     assert PatchDepth()(step).item() == 0
     faint = torch.full((6,), -30.0, dtype=torch.float64, requires_grad=True)
-    for which in ("plain", "soft"):  # nothing is drawn: the depth is 0 everywhere
+    for which in ("plain", "soft"):  # nothing is rendered: the depth is 0 everywhere
         assert PatchDepth(which=which)(take_step(opacity_logits=faint)).isfinite()
 
 
@@ -215,7 +215,7 @@ def test_it_is_the_formula(take_step):
     assert SmoothDepth(0.3)(step).item() == pytest.approx(expected, rel=1e-9)
 
 
-def test_nothing_drawn_is_no_error(take_step):
+def test_nothing_rendered_is_no_error(take_step):
     step = take_step(opacity_logits=torch.full((6,), -30.0, dtype=torch.float64, requires_grad=True))
     assert SmoothDepth()(step).item() == 0
 

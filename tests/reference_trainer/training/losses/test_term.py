@@ -14,11 +14,11 @@ from reference_trainer.training.trainer import Trainer
 
 
 def test_a_weight_follows_its_schedule_and_idle_terms_are_not_met(tiny_scene, monkeypatch):
-    depths, draw = [], BuiltinRenderer.__call__
+    depths, render = [], BuiltinRenderer.__call__
 
     def spied(self, **arguments):
         depths.append(arguments["depth"])
-        return draw(self, **arguments)
+        return render(self, **arguments)
 
     monkeypatch.setattr(BuiltinRenderer, "__call__", spied)
     loss = "photometric + smooth_depth(between(0.1, 2, 3)) + warp(0.0) + opacity(0.01)"
