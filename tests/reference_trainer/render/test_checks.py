@@ -77,21 +77,21 @@ def test_a_background_that_is_not_finite_is_refused(scene):
 
 def test_a_new_background_takes_no_further_wait(card):
     waits, scene = [], random_scene(40, 24, 16, seed=2).to(torch.float32, card)
-    draw(scene)
+    rendered(scene)
     for background in (None, torch.rand(3, device=card), torch.rand(3, device=card)):
         with counted_synchronizations() as found:
-            draw(scene, background=background)
+            rendered(scene, background=background)
         waits.append(found.total())
     assert waits[2] == waits[1] == waits[0]
 
 
 def test_a_background_that_is_changed_is_looked_at_again(scene):
     background = torch.rand(3, device=scene.means.device)
-    draw(scene, background=background)
+    rendered(scene, background=background)
     background[1] = math.nan
     for opacities in (scene.opacities, torch.zeros_like(scene.opacities)):  # also where nothing is in view
         with pytest.raises(NotFiniteError, match=r"background must be finite"):
-            draw(scene, background=background, opacities=opacities)
+            rendered(scene, background=background, opacities=opacities)
 
 
 def test_a_sum_that_overflows_over_finite_numbers_is_no_mistake(scene):
