@@ -221,7 +221,8 @@ def source_views(cameras: Sequence[Camera], number: int, depth: float) -> list[i
     """Return the up to two cameras best suited to match what one of them sees at a depth, the best first.
 
     They see at least a quarter of it, from directions 0.5 to 60 degrees apart, best 12: nearer ones measure depth
-    poorly, and from further away surfaces look different.
+    poorly, and from further away surfaces look different. Of two in one place, as of a photograph that is there twice,
+    the second would confirm whatever the first one says: only one is taken.
     """
     points = _grid(cameras[number], torch.tensor([depth]))[0]
     worth = []
@@ -229,7 +230,11 @@ def source_views(cameras: Sequence[Camera], number: int, depth: float) -> list[i
         seen, angles = _shared(points, cameras[number], camera)
         if other != number and seen >= OVERLAP and ANGLES[0] <= angles <= ANGLES[1]:
             worth.append((seen * math.exp(-(math.log(angles / USUAL) ** 2)), other))
-    return [other for _, other in sorted(worth, key=lambda pair: (-pair[0], pair[1]))[:SOURCES]]
+    chosen = list[int]()
+    for _, other in sorted(worth, key=lambda pair: (-pair[0], pair[1])):
+        if all(_shared(points, cameras[other], cameras[taken])[1] >= ANGLES[0] for taken in chosen):
+            chosen.append(other)
+    return chosen[:SOURCES]
 
 
 def matched_size(width: int, height: int, most: int = PIXELS) -> tuple[int, int]:

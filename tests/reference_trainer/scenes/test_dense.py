@@ -175,6 +175,12 @@ def test_source_views_are_near_but_not_too_near():
     assert source_views(cameras, 0, 5.0) == [2, 3]  # 9 and 13 degrees apart, more overlap; 0.1 and 80 degrees
 
 
+def test_of_two_source_views_in_one_place_one_is_taken():
+    cameras = [looking(x) for x in (0.0, 1.0, 1.01, 0.5)]
+    assert source_views(cameras, 0, 5.0)[0] in (1, 2)
+    assert source_views(cameras, 0, 5.0)[1:] == [3]
+
+
 def test_aggregation_is_the_recurrence_of_semi_global_matching():
     """Against the formula for every pixel and plane, along all eight directions; edges make a jump cheaper."""
     from reference_trainer.compiled.stereo import aggregate
