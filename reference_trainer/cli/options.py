@@ -55,6 +55,17 @@ class RenderOptions:
     """What renders: "numba" (compiled; float32 on a CPU), "torch" (anything), "triton" (float32 on a CUDA card), or
     "auto", whichever fits. By default $CA_REG_ENGINE, or "auto"."""
 
+    def choose(self, device: str) -> None:
+        """Choose the engine of this process and its workers, or refuse it with a ValueError."""
+        from reference_trainer.render import chosen_engine, use_engine
+
+        if self.engine == "triton" and device == "cpu" and os.environ.get("TRITON_INTERPRET") != "1":
+            raise ValueError(
+                "the engine triton renders on a card, not on cpu: give --device cuda or another engine "
+                "(TRITON_INTERPRET=1 interprets its kernels on a processor, slowly)."
+            )
+        use_engine(self.engine) if self.engine is not None else chosen_engine()
+
     def begin(self, device: str, *, trains: bool = False) -> None:
         """Choose the engine of this process and its workers, and print which it is.
 
@@ -63,15 +74,9 @@ class RenderOptions:
         """
         import torch
 
-        from reference_trainer.render import describe_engine, use_engine
+        from reference_trainer.render import describe_engine
 
-        if self.engine == "triton" and device == "cpu" and os.environ.get("TRITON_INTERPRET") != "1":
-            raise ValueError(
-                "the engine triton renders on a card, not on cpu: give --device cuda or another engine "
-                "(TRITON_INTERPRET=1 interprets its kernels on a processor, slowly)."
-            )
-        if self.engine is not None:
-            use_engine(self.engine)
+        self.choose(device)
         hint = "; a CUDA card is here: --device cuda uses it" if device == "cpu" and torch.cuda.is_available() else ""
         print(f"Engine: {describe_engine(device)}{hint}", flush=True)
         if trains and device == "cpu":

@@ -6,8 +6,10 @@ import math
 import os
 import shlex
 import shutil
+import statistics
 import sys
 import webbrowser
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -29,16 +31,19 @@ RECIPE = "sparse"
 """The best setting known for few photographs."""
 PRESETS = {"quick": (1_000, 100_000), "default": (2_000, 200_000), "quality": (5_000, 500_000)}
 """Training steps, and pixels to which photographs are reduced."""
+FAR = 4.0
+"""Photographs of so many times more or fewer pixels than most are named: all are reduced by one factor."""
 MARK = "photographs.json"
 Step = Literal["photographs", "poses", "train", "evaluate", "report"]
 _WRITTEN: dict[Step, tuple[str, ...]] = {
-    "photographs": (MARK, run.SCENE),
+    "photographs": (run.SCENE, MARK),
     "poses": (f"{run.SCENE}/*/sparse",),
     "train": (run.CHECKPOINT, run.CONFIG, run.PLAN, run.PLY, run.BAKED_PLY, "ca.jsonl", "events.out.*"),
     "evaluate": (run.RESULTS, "evaluation.partial.json", run.VIEWS),
     "report": ("report.html",),
 }
-"""What each step writes. `--from` deletes that of a step and of those after it."""
+"""What each step writes. `--from` deletes that of a step and of those after it, the last first: without the mark the
+folder would be somebody else's."""
 
 _TRAINING, _SHOWN, _MATCHED, _REFERENCE = 2.0, 30.0, 115.0, 2.9e-7
 """Of `_forecast`: a training step, measuring and showing a view, and a photograph of the dense start if it is matched
@@ -96,63 +101,108 @@ class Run:
             raise ValueError(f"expected at least 2 --frames of a video, got {self.frames}.")
         if self.folder.resolve() in self.photos.resolve().parents:
             raise ValueError(f"the photographs are in {self.folder}, to which nothing is written: give another --out.")
-        others = (run.SCENE, run.CONFIG, run.CHECKPOINT, run.PLY, run.RESULTS, run.VIEWS, run.COMPARISON)
-        run.check_output(self.folder, self.photos, () if (self.folder / MARK).exists() else others)
+        SceneOptions(test=self.test, points=self.points)  # refuses what no scene has
+        place = next(path for path in (self.folder.absolute(), *self.folder.absolute().parents) if path.exists())
+        if not place.is_dir() or not os.access(place, os.W_OK):
+            raise PermissionError(f"{self.folder} cannot be written to, because of {place}: give another --out.")
+        others = (MARK, run.SCENE, run.CONFIG, run.CHECKPOINT, run.PLY, run.RESULTS, run.VIEWS, run.COMPARISON)
+        run.check_output(self.folder, self.photos, () if self._mark() else others)
         run.report_file([self.folder])
 
     def __call__(self) -> None:
         from reference_trainer.runs.run import run_experiment
 
+        self.rendering.choose(self.device)
         scene = self._photographs()
         self.rendering.begin(self.device, trains=True)
         options, config = self._settings(scene)
-        self._begin_again("evaluate", "report")  # only now: other settings are refused with all results in place
+        if self.again not in (None, "photographs"):  # only now: what is refused is refused with everything in place
+            with run.run_lock(self.folder):
+                self._begin_again()
         print(self._forecast(scene, options, config), flush=True)
         self._poses(scene)
         run_experiment(options, config, self.folder, auto=True, device=self.device, progress=True)
         self._report()
 
     def _photographs(self) -> Path:
-        """Name what cannot be read, and return the folder of the scene: that of the photographs if it has cameras."""
+        """Put the photographs in place, and return the folder of the scene: their own if they have cameras."""
         from reference_trainer.evaluation.results import write_json
+        from reference_trainer.scenes.photographs import collect_photographs
+
+        sources, scene = self._sources()
+        about: dict[str, Any] = {"frames": self.frames, "files": {path.name: path.stat().st_size for path in sources}}
+        with run.run_lock(self.folder):
+            if self.again != "photographs" and (place := self._in_place(about, scene)):
+                return place
+            names, part = list[str](), self.folder / ".photographs.part"
+            shutil.rmtree(part, ignore_errors=True)  # left by a process that was killed
+            try:
+                if scene != self.photos:
+                    names = collect_photographs(sources, part, self.frames)
+                    _check_number(len(names), f"{', '.join(path.name for path in sources)} gave", "picture")
+                if self.again == "photographs":
+                    self._begin_again()
+                write_json(self.folder / MARK, about)  # the folder is ours from now on
+                if names:
+                    shutil.rmtree(scene / "images", ignore_errors=True)  # which holds nothing
+                    scene.mkdir(parents=True, exist_ok=True)
+                    part.rename(scene / "images")
+            finally:
+                shutil.rmtree(part, ignore_errors=True)
+            print(f"photographs: {len(names)}, in {scene}" if names else f"photographs with cameras: {scene}")
+        return scene
+
+    def _sources(self) -> tuple[list[Path], Path]:
+        """Return photographs and videos, and the folder of their scene; name, or refuse, what cannot be used."""
         from reference_trainer.scenes.load import find_reader  # from where all formats are known
-        from reference_trainer.scenes.photographs import collect_photographs, is_video, sort_photographs
+        from reference_trainer.scenes.photographs import is_video, sort_photographs, unread_folders
 
         sources, wrong = sort_photographs(self.photos)
-        for name, why in wrong.items():
-            print(f"not read, and left out: {'' if name in why else f'{name}: '}{why}", file=sys.stderr)
-        scene, mark = self.folder / run.SCENE / self._name, self.folder / MARK
+        scene = self.folder / run.SCENE / self._name
         with suppress(ValueError, FileNotFoundError):
             find_reader(self.photos, "auto")
             scene = self.photos
-        if scene != self.photos and find_spec("pycolmap") is None:
+        wrong |= {} if scene == self.photos else unread_folders(self.photos)
+        for name, why in wrong.items():
+            print(f"left out: {'' if name in why else f'{name}: '}{why}", file=sys.stderr)
+        if scene == self.photos:
+            self._sizes(scene)  # cameras that cannot be read are refused before anything is written
+        elif find_spec("pycolmap") is None:
             raise ImportError("these photographs have no cameras, and finding them needs pip install 'ca_reg[colmap]'.")
-        if scene != self.photos and len(sources) < 2 and not any(map(is_video, sources)):
-            held = f"{len(sources) or 'no'} photograph{'s' * (len(sources) != 1)}"
-            raise ValueError(f"{self.photos} holds {held} that can be read; it takes at least 2, better 3 or more.")
-        about: dict[str, Any] = {"frames": self.frames, "files": {path.name: path.stat().st_size for path in sources}}
-        with run.run_lock(self.folder):
-            if self.again == "photographs":  # else those that changed are refused with everything in place
-                self._begin_again("photographs", "poses", "train")
-            before = read_json(mark) if mark.exists() else {}
-            if not before:
-                write_json(mark, before)  # the folder is ours from now on, should this be interrupted
-                names = [] if scene == self.photos else collect_photographs(sources, scene / "images", self.frames)
-                write_json(mark, about)
-                print(f"photographs: {len(names)}, in {scene}" if names else f"photographs with cameras: {scene}")
-            elif before != about:
-                changed = {name for name, _ in about["files"].items() ^ before["files"].items()} or {"--frames"}
-                raise ValueError(
-                    f"{self.folder} was made from other photographs, see {', '.join(sorted(changed))}: give another "
-                    "--out, or begin again with --from photographs."
-                )
-            elif scene != self.photos:  # where they were put, by the name that the photographs had then
-                scene = next((images.parent for images in (self.folder / run.SCENE).glob("*/images")), scene)
-            self._begin_again("poses", "train")
-        return scene
+        elif not any(map(is_video, sources)):
+            _check_number(len(sources), f"{self.photos} holds", "photograph", " that can be read")
+        return sources, scene
 
-    def _sizes(self, scene: Path) -> tuple[tuple[int, int], int]:
-        """Return width and height of the largest photograph, and how many there are, placed or not."""
+    def _mark(self) -> dict[str, Any] | None:
+        """Return what an earlier call noted of the photographs; None if nothing, or the file is somebody else's."""
+        with suppress(OSError, ValueError):
+            match mark := read_json(self.folder / MARK):
+                case {"frames": int(), "files": dict() as files} if all(isinstance(x, int) for x in files.values()):
+                    return dict(mark)
+        return None
+
+    def _in_place(self, about: dict[str, Any], scene: Path) -> Path | None:
+        """Return the folder of the scene if an earlier call has put the same photographs there; refuse others."""
+        from reference_trainer.scenes.photographs import is_video
+
+        before = self._mark()
+        if before is None:
+            return None
+        changed = {name for name, _ in about["files"].items() ^ before["files"].items()}
+        if before["frames"] != self.frames and any(is_video(Path(name)) for name in about["files"]):
+            changed.add("--frames")
+        if changed:
+            raise ValueError(
+                f"{self.folder} was made from other photographs, see {', '.join(sorted(changed))}: give another "
+                "--out, or begin again with --from photographs."
+            )
+        if scene == self.photos:
+            return scene
+        # By the name that the photographs had then.
+        return next((path.parents[1] for path in (self.folder / run.SCENE).glob("*/images/*")), None)
+
+    def _sizes(self, scene: Path) -> dict[Path, tuple[int, int]]:
+        """Return width and height of every photograph, placed or not."""
         from reference_trainer.scenes.images import image_size, list_images
         from reference_trainer.scenes.load import find_reader
 
@@ -160,7 +210,7 @@ class Run:
             paths = [frame.path for frame in find_reader(scene, "auto")(scene, SceneOptions(str(scene))).frames]
         else:
             paths = list_images(scene / "images")
-        return max(map(image_size, paths), key=math.prod), len(paths)
+        return {path: image_size(path) for path in paths}
 
     def _makes_dense_start(self, options: SceneOptions, count: int, *, posed: bool) -> bool:
         """Return whether the training begins with a dense start; how many points `poses` leaves is not known before."""
@@ -174,21 +224,26 @@ class Run:
         scene = load_scene(options, trains=False)
         return made_unasked(len(scene.points.positions), len(scene.train))
 
-    def _begin_again(self, *steps: Step) -> None:
-        """Delete what these steps wrote, as far as `--from` says."""
-        order = list(_WRITTEN)
-        for step in steps:
-            if self.again and order.index(step) >= order.index(self.again):
-                for path in [path for name in _WRITTEN[step] for path in self.folder.glob(name)]:
-                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    def _begin_again(self) -> None:
+        """Delete what the step of `--from` and those after it wrote."""
+        assert self.again is not None
+        steps = list(_WRITTEN)
+        for step in reversed(steps[steps.index(self.again) :]):
+            for path in [path for name in _WRITTEN[step] for path in self.folder.glob(name)]:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def _settings(self, scene: Path) -> tuple[SceneOptions, TrainConfig]:
         """Return what is trained; refuses to go on with a run that was begun with other settings, which are named."""
+        from reference_trainer.scenes.images import path_inside
+
+        cloud, written = path_inside(scene, self.points), "sparse/0"  # by the poses
+        if self.points.partition(":")[0] not in ("auto", "dense", "random", written) and not cloud.exists():
+            raise FileNotFoundError(f"there is no {cloud} for --points: give auto, dense, random or one that is there.")
         steps, pixels = PRESETS["quick" if self.quick else "quality" if self.quality else "default"]
-        factor = max(1.0, math.sqrt(math.prod(self._sizes(scene)[0]) / pixels))
+        factor = max(1.0, math.sqrt(math.prod(_usual(self._sizes(scene).values())) / pixels))
         options = SceneOptions(str(scene), test=self.test, points=self.points, downscale=round(factor, 3))
         config = with_recipe(RECIPE, iterations=steps)
-        if (self.folder / run.CONFIG).exists():
+        if (self.folder / run.CONFIG).exists() and self.again not in ("poses", "train"):
             try:
                 run.settings_of_run(self.folder, options, config, auto=True, given=())
             except ValueError as error:
@@ -210,34 +265,39 @@ class Run:
 
         if (self.folder / run.RESULTS).exists():
             return "Trained and measured before."
-        (width, height), count = self._sizes(scene)
-        factor, done = options.downscale or 1.0, 0
+        full, factor, done = self._sizes(scene), options.downscale or 1.0, 0
         if (self.folder / run.CHECKPOINT).exists():
             done = load_checkpoint(self.folder / run.CHECKPOINT)["step"]
-        size = round(width / factor), round(height / factor)
-        pixels, step = math.prod(size), step_seconds(*size, self.device)
+        sizes = {path: (max(1, round(w / factor)), max(1, round(h / factor))) for path, (w, h) in full.items()}
+        count, usual = len(sizes), _usual(sizes.values())
+        pixels = statistics.fmean(map(math.prod, sizes.values()))
+        step = step_seconds(*usual, self.device) * pixels / math.prod(usual)
         core = step if self.device == "cpu" else _REFERENCE * pixels  # cameras and points are found by the processor
         times, posed = {}, scene == self.photos or bool(colmap_folders(scene))
         if not posed:
-            megapixels = math.prod(feature_size(width, height, few=count < FEW)) / 1e6
-            work = count * megapixels * (10.0 if count < FEW else 2.0) + 0.025 * count * (count - 1) / 2
+            megapixels = sum(math.prod(feature_size(*size, few=count < FEW)) for size in full.values()) / 1e6
+            work = megapixels * (10.0 if count < FEW else 2.0) + 0.025 * count * (count - 1) / 2
             times["poses"] = core / (_REFERENCE * pixels) * work
         if not done and self._makes_dense_start(options, count, posed=posed):
-            times["points"] = core * _MATCHED * count * math.prod(matched_size(*size)) / pixels
+            times["points"] = core * _MATCHED * sum(math.prod(matched_size(*size)) for size in sizes.values()) / pixels
         times["training"] = step * _TRAINING * (config.iterations - done)
         times["scores and page"] = step * _SHOWN * 3 * min(count, 8)
         parts = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in times.items())
-        return f"This will take about {_duration(sum(times.values()))} on this machine as it is now: {parts}."
+        ratios = {path: math.prod(size) / math.prod(usual) for path, size in sizes.items()}
+        far = [f"{path.name} at {w}x{h}" for path, (w, h) in sizes.items() if not 1 / FAR <= ratios[path] <= FAR]
+        about = f"By one factor for all, most photographs train at {usual[0]}x{usual[1]}, but {', '.join(far)}.\n"
+        total = _duration(sum(times.values()))
+        return f"{about * bool(far)}This will take about {total} on this machine as it is now: {parts}."
 
     def _poses(self, scene: Path) -> None:
         """Find the cameras of photographs that have none."""
         from reference_trainer.scenes.colmap import colmap_folders
-        from reference_trainer.scenes.poses import find_poses
+        from reference_trainer.scenes.poses import find_poses, left_out
 
         if scene == self.photos:
             return
         if found := colmap_folders(scene):
-            print(f"poses: in {found[0]}, as before")
+            print("\n".join([f"poses: in {found[0]}, as before", *left_out(scene)]))
             return
         with run.run_lock(self.folder):
             print(find_poses(scene, progress=True))
@@ -259,6 +319,23 @@ class Run:
         if self.open and screen:
             with suppress(webbrowser.Error):
                 webbrowser.open(page.resolve().as_uri())
+
+
+def _check_number(number: int, whose: str, what: str, which: str = "") -> None:
+    """Refuse fewer than two pictures with a ValueError."""
+    if number < 2:
+        held = f"{number or 'no'} {what}{'s' * (number != 1)}{which}"
+        raise ValueError(f"{whose} {held}; it takes at least 2, better 3 or more.")
+
+
+def _usual(sizes: Collection[tuple[int, int]]) -> tuple[int, int]:
+    """Return the median size, of two the larger.
+
+    Example:
+        >>> _usual([(640, 480), (4000, 3000), (640, 480)])
+        (640, 480)
+    """
+    return sorted(sizes, key=math.prod)[len(sizes) // 2]
 
 
 def _duration(seconds: float) -> str:

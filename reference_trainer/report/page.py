@@ -50,6 +50,7 @@ from reference_trainer.runs.folder import (
     runs_of,
 )
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.poses import left_out
 from reference_trainer.scenes.scene import View, Viewpoint
 from reference_trainer.scenes.virtual_cameras import interpolate_cameras
 from reference_trainer.training.config import TrainConfig
@@ -205,7 +206,9 @@ def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Pa
     strategies = _strategies(runs, results, configs, whole, colors)
     table, differing = _settings(configs)
     said, evidence = verdict(strategies, differing)
-    notes = [note for each in found for note in each.notes]
+    scenes = dict.fromkeys(options.path for options, _ in configs.values())
+    notes = [note for scene in scenes for note in left_out(Path(scene))]
+    notes += [note for each in found for note in each.notes]
     notes += [f"{label}: no scores, it has not been trained to its end." for label in runs.keys() - results.keys()]
     curves, missing = _curves(runs)
     middle = next((each.heat.mean for each in found if each.heat is not None), 1.0)

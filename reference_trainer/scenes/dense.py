@@ -81,7 +81,7 @@ def dense_points(views: Sequence[View], guide: PointCloud | None = None, *, coun
 
     A plane sweep with semi-global aggregation gives every photograph a depth map, slanted windows refine it, and only
     depths on which photographs agree become points, one per voxel whose size grows with the distance from the cameras.
-    The result depends on nothing but the arguments.
+    Of photographs that are the same, only the first is looked at. The result depends on nothing but the arguments.
 
     Args:
         views: the training views; their `depth`, if known, is not looked at.
@@ -90,30 +90,46 @@ def dense_points(views: Sequence[View], guide: PointCloud | None = None, *, coun
         count: the largest number of points.
 
     Raises:
-        ValueError: if there are fewer than 2 views, two of their photographs are the same, no two cameras see the same
-            from different places, or fewer than 1,000 points are found.
+        ValueError: if there are fewer than 2 different photographs, no two cameras see the same from different places,
+            or fewer than 1,000 points are found.
         ImportError: if numba is missing.
     """
-    _check(views)
+    views, about = _different(views)
+    if about:
+        logging.getLogger(__name__).info("dense start: %s", about)
     return _enough(_measure(views, guide, count), views, count)
 
 
-def _check(views: Sequence[View]) -> None:
-    """Refuse what cannot be measured on, before the work."""
+def _different(views: Sequence[View]) -> tuple[list[View], str]:
+    """Return the views whose photographs differ from those before them, and a note on the others.
+
+    What cannot be measured on is refused before the work.
+    """
     try:
         import reference_trainer.compiled.stereo as _  # noqa: F401
     except ImportError as error:
         raise ImportError(
             "a dense start needs numba: pip install 'ca_reg[trainer]', or choose other points."
         ) from error
-    if len(views) < 2:
-        raise ValueError(f"a dense start needs at least 2 training photographs, got {len(views)}: choose other points.")
-    for i, view in enumerate(views):
-        for other in views[:i]:
-            if view.image.shape == other.image.shape and float((view.image - other.image).abs().mean()) < 1 / 255:
-                raise ValueError(
-                    f"a dense start needs different photographs: {other.name} and {view.name} are the same."
-                )
+    different, same = list[View](), list[str]()
+    for view in views:
+        original = next((other for other in different if _alike(other.image, view.image)), None)
+        if original is None:
+            different.append(view)
+        else:
+            same.append(f"{view.name} shows the same as {original.name} and is left out")
+    about = "; ".join(same)
+    if len(different) < 2:
+        raise ValueError(
+            f"a dense start needs at least 2 different training photographs, got {len(different)}"
+            f"{f' ({about})' * bool(about)}: choose other points."
+        )
+    return different, about
+
+
+def _alike(one: Tensor, other: Tensor) -> bool:
+    """Whether two pictures are the same but for what saving one again changes."""
+    return one.shape == other.shape and float((one - other).abs().mean()) < 1 / 255
 
 
 def _enough(cloud: PointCloud, views: Sequence[View], count: int) -> PointCloud:
@@ -152,11 +168,12 @@ def dense_start(views: Sequence[View], measured: PointCloud) -> tuple[PointCloud
     ``$XDG_CACHE_HOME``, else of ``~/.cache``, named by a hash of all that they depend on. Errors are those of
     `dense_points`.
     """
-    _check(views)
+    views, about = _different(views)
     dense = _enough(_cached(views, measured), views, COUNT)
     assert dense.confidence is not None
     number, more = len(dense.positions), len(measured.positions)
     note = f"initial points: {number:,} measured on the {len(views)} training photographs by dense stereo"
+    note += f" ({about})" * bool(about)
     if more == 0:
         return dense, note
     cloud = replace(
@@ -204,7 +221,8 @@ def source_views(cameras: Sequence[Camera], number: int, depth: float) -> list[i
     """Return the cameras that match best what one of them sees at a depth: up to two, the best first.
 
     Each sees at least a quarter of it, from a direction 0.5 to 60 degrees away, at best 12: closer directions measure
-    depth poorly, and from further away surfaces look different.
+    depth poorly, and from further away surfaces look different. Of two in one place, as of a photograph that is there
+    twice, the second would confirm whatever the first one says: only one is taken.
     """
     points = _grid(cameras[number], torch.tensor([depth]))[0]
     worth = []
@@ -212,7 +230,11 @@ def source_views(cameras: Sequence[Camera], number: int, depth: float) -> list[i
         seen, angles = _shared(points, cameras[number], camera)
         if other != number and seen >= OVERLAP and ANGLES[0] <= angles <= ANGLES[1]:
             worth.append((seen * math.exp(-(math.log(angles / USUAL) ** 2)), other))
-    return [other for _, other in sorted(worth, key=lambda pair: (-pair[0], pair[1]))[:SOURCES]]
+    chosen = list[int]()
+    for _, other in sorted(worth, key=lambda pair: (-pair[0], pair[1])):
+        if all(_shared(points, cameras[other], cameras[taken])[1] >= ANGLES[0] for taken in chosen):
+            chosen.append(other)
+    return chosen[:SOURCES]
 
 
 def matched_size(width: int, height: int, most: int = PIXELS) -> tuple[int, int]:

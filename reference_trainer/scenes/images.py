@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,23 @@ import torch
 from torch import Tensor
 
 __all__ = [
-    "composite", "decode_image", "image_folder", "image_size", "is_image", "list_images", "match_images",
-    "opened_image", "path_inside", "read_image", "resize_image", "unreadable_photographs",
+    "composite",
+    "decode_image",
+    "has_alpha",
+    "image_folder",
+    "image_size",
+    "is_image",
+    "list_images",
+    "match_images",
+    "opened_image",
+    "path_inside",
+    "photograph_folder",
+    "read_image",
+    "resize_image",
+    "unreadable_photographs",
 ]  # fmt: skip
 
-IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".bmp", ".tif", ".tiff", ".webp"})
 OTHER_PHOTOGRAPHS = frozenset(
     {".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 )
@@ -44,9 +56,9 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
             pixels.
     """
     decoded = decode_image(path)
-    width, height, has_alpha = decoded.width, decoded.height, decoded.mode == "RGBA"
+    width, height = decoded.width, decoded.height
     image = torch.empty(3, height, width)
-    alpha = torch.empty(height, width) if has_alpha else None
+    alpha = torch.empty(height, width) if decoded.mode == "RGBA" else None
     rows = max(1, _BAND // width)
     for top in range(0, height, rows):
         band = np.array(decoded.crop((0, top, width, min(top + rows, height))))
@@ -69,8 +81,12 @@ def decode_image(path: str | Path) -> Any:
     with opened_image(path) as file:
         if file.format == "TIFF":
             _check_strips(file)
-        has_alpha = mode in ("RGBA", "LA", "PA") or "transparency" in file.info
-        return file.convert("RGBA" if has_alpha else "RGB")
+        return file.convert("RGBA" if has_alpha(file) else "RGB")
+
+
+def has_alpha(picture: Any) -> bool:
+    """Whether a Pillow image has transparency."""
+    return picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
@@ -138,6 +154,16 @@ def list_images(folder: str | Path) -> list[Path]:
 def is_image(path: Path) -> bool:
     """Whether a file is a picture by its name; ``._a.jpg``, which macOS leaves on other file systems, is not."""
     return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+
+
+def photograph_folder(scene: Path, kinds: Collection[str] = IMAGE_SUFFIXES | OTHER_PHOTOGRAPHS) -> Path:
+    """Return where the photographs of a folder are: in its ``images``, if files of these kinds are there, else itself.
+
+    The kinds are suffixes; files that begin with a dot do not count.
+    """
+    images = scene / "images"
+    found = images.iterdir() if images.is_dir() else ()
+    return images if any(path.suffix.lower() in kinds and path.name[0] != "." for path in found) else scene
 
 
 def unreadable_photographs(folder: Path) -> list[str]:
@@ -210,8 +236,8 @@ def image_folder(root: Path, name: str | None, usual: str = "images") -> Path:
         reduced = [path for path, factor in factors.items() if factor.isdecimal()]
         found = [root / usual] if (root / usual).is_dir() else []
         found += sorted(reduced, key=lambda path: int(factors[path]))
-        found = [path for path in found if any(map(is_image, path.iterdir()))] or found[:1]
-        found = found or ([root] if any(map(is_image, root.iterdir())) else [])
+        first, found = found[:1], [path for path in found if any(map(is_image, path.iterdir()))]
+        found = found or ([root] if any(map(is_image, root.iterdir())) else first)
     if not found:
         others = sorted(each.name for each in root.iterdir() if each.is_dir() and any(map(is_image, each.iterdir())))
         raise FileNotFoundError(

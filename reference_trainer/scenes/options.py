@@ -75,6 +75,12 @@ class SceneOptions:
             raise ValueError(f"views must be at least 1, got {self.views}.")
         if self.test not in ("auto", "none"):
             raise ValueError(f"test must be auto or none, got {self.test!r}.")
+        kind, colon, count = self.points.partition(":")
+        if not self.points or (kind == "random" and colon and not (count.isdecimal() and int(count) > 0)):
+            raise ValueError(
+                "points must be auto, dense, random, random:<count> such as random:10000, or a .ply or COLMAP folder "
+                f"of the scene, got {self.points!r}."
+            )
         if self.init is not None and self.points != "auto":
             raise ValueError(f"init takes the place of points: leave out one of {self.init} and {self.points}.")
 

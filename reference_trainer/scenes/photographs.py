@@ -2,24 +2,47 @@
 
 from __future__ import annotations
 
+import filecmp
+import logging
 import shutil
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from reference_trainer.files import replacing
-from reference_trainer.scenes.images import FORMATS, OTHER_PHOTOGRAPHS, decode_image, is_image, opened_image
+from reference_trainer.scenes.images import (
+    FORMATS,
+    IMAGE_SUFFIXES,
+    OTHER_PHOTOGRAPHS,
+    decode_image,
+    has_alpha,
+    opened_image,
+    photograph_folder,
+)
 
-__all__ = ["collect_photographs", "is_video", "sharpest_frames", "sort_photographs"]
+__all__ = ["collect_photographs", "is_video", "sharpest_frames", "sort_photographs", "unread_folders"]
 
 HEIC = frozenset({".heic", ".heif"})
-VIDEOS = frozenset({".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi"})
-_AS_THEY_ARE = frozenset({".jpg", ".jpeg", ".png"})  # what COLMAP reads
+VIDEOS = frozenset(
+    {".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi", ".wmv", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".3g2"}
+)
+_KINDS = IMAGE_SUFFIXES | OTHER_PHOTOGRAPHS | VIDEOS
+_AS_THEY_ARE = frozenset({".jpg", ".jpeg", ".jpe", ".jfif", ".png"})  # what COLMAP reads
+_COPIES = dict.fromkeys(OTHER_PHOTOGRAPHS, _AS_THEY_ARE) | {".mov": _AS_THEY_ARE | HEIC}
+"""What cameras and phones write of one photograph under one name: these kinds of files beside those."""
+_BESIDE = frozenset(
+    {".aae", ".xmp", ".pp3", ".thm", ".lrv", ".db", ".ini", ".txt", ".json", ".csv", ".xml", ".md"}
+    | {".bin", ".ply", ".npy", ".npz"}
+)
+"""What programs keep beside photographs, and what scenes are made of: nobody takes them for photographs."""
 _ORIENTATION = 0x0112  # EXIF
 _JUDGED = 640  # pixels of the longer side at which sharpness is judged
+_log = logging.getLogger(__name__)
 
 
 def is_video(path: Path) -> bool:
@@ -31,7 +54,9 @@ def sort_photographs(source: Path) -> tuple[list[Path], dict[str, str]]:
     """Return the photographs and videos that can be read, and by name the others with what is wrong with them.
 
     ``source`` is a folder with the files, or with a folder ``images`` of them, or one video. Every photograph is
-    decoded to its end. One that is there twice, as a phone exports IMG_1.HEIC beside IMG_1.JPG, is taken once.
+    decoded to its end. One that is there twice is taken once: of equal files the others are named, and what a phone or
+    a camera writes of one photograph, such as IMG_1.HEIC and IMG_1.MOV beside IMG_1.JPG, needs no word, nor do hidden
+    files and those that programs keep beside photographs.
 
     Raises:
         FileNotFoundError: if there is no such file or folder.
@@ -39,52 +64,80 @@ def sort_photographs(source: Path) -> tuple[list[Path], dict[str, str]]:
     """
     if not source.exists():
         raise FileNotFoundError(f"there is no folder {source}: give the folder of the photographs, or a video.")
-    folder = source / "images" if (source / "images").is_dir() else source
-    files = [source] if source.is_file() else sorted(path for path in folder.iterdir() if path.name[0] != ".")
-    files.sort(key=lambda path: path.suffix.lower() not in _AS_THEY_ARE)  # first choice of one that is there twice
-    usable, wrong = dict[str, Path](), dict[str, str]()
+    folder = photograph_folder(source, _KINDS)
+    files = [source] if source.is_file() else [path for path in folder.iterdir() if path.is_file()]
+    # Of what is there twice, the first choice comes first.
+    files.sort(key=lambda path: (path.suffix.lower() not in _AS_THEY_ARE, is_video(path), path.stem, path))
+    usable, wrong = list[Path](), dict[str, str]()
+    of_size, of_stem = defaultdict[int, list[Path]](list), defaultdict[str, set[str]](set)
     for path in files:
         kind = path.suffix.lower()
-        if path.is_dir() or path.stem in usable:
+        if path.name.startswith(".") or kind in _BESIDE or of_stem[path.stem] & _COPIES.get(kind, frozenset()):
             continue
         try:
+            alike = of_size[path.stat().st_size]
+            if same := next((other for other in alike if filecmp.cmp(path, other, shallow=False)), None):
+                raise ValueError(f"{path.name} is the same file as {same.name}")
             if is_video(path):
-                _opened_video(path).close()
+                _check_video(path)
             elif kind in HEIC:
                 _upright(path)
-            elif is_image(path):
+            elif kind in IMAGE_SUFFIXES:
                 decode_image(path)
-            elif kind in OTHER_PHOTOGRAPHS:
-                raise ValueError(f"{kind[1:].upper()} is not read: save it as JPEG or PNG")
             else:
-                continue
-            usable[path.stem] = path
+                unsure = "" if kind in OTHER_PHOTOGRAPHS else ", if it is a photograph"
+                raise ValueError(f"{kind[1:].upper() or 'this'} is not read: save it as JPEG or PNG{unsure}")
+            usable.append(path)
+            alike.append(path)
+            of_stem[path.stem].add(kind)
         except (ValueError, OSError) as error:
             wrong[path.name] = str(error)
-    return sorted(usable.values()), wrong
+    return sorted(usable), wrong
+
+
+def unread_folders(source: Path) -> dict[str, str]:
+    """Return what to do about photographs, down to two levels, that `sort_photographs` does not read, by folder.
+
+    Only their owner knows which are of one place.
+    """
+    read = photograph_folder(source, _KINDS)
+    found = (path for pattern in ("*", "*/*", "*/*/*") for path in source.glob(pattern) if path.parent != read)
+    shown = (path for path in found if not any(part[0] == "." for part in path.relative_to(source).parts))
+    held = Counter(path.parent for path in shown if path.suffix.lower() in _KINDS and path.is_file())
+    return {
+        str(folder): f"{number} photographs or videos in {folder} are not read: move them to {read}"
+        + ", or give their folder instead" * (folder != source)
+        for folder, number in held.items()
+    }
 
 
 def collect_photographs(sources: Sequence[Path], folder: Path, frames: int = 16) -> list[str]:
     """Write photographs and frames of videos, of `sort_photographs`, to a folder, upright; return the names there.
 
-    JPEG and PNG files are copied as they are unless an orientation tag turns them; all others become JPEG, with their
-    EXIF data, of which COLMAP uses the focal length. Of each video so many ``frames`` are taken, the sharpest in as
-    many equal parts of its duration.
+    JPEG and PNG files are copied as they are unless an orientation tag turns them; all others become JPEG, or PNG where
+    they are transparent, with their EXIF data, of which COLMAP uses the focal length. Of each video so many ``frames``
+    are taken, the sharpest in as many equal parts of its duration. No two names differ in their endings or case alone.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    names = []
+    names, taken = list[str](), set[str]()
+
+    def place(stem: str, suffix: str) -> Path:
+        """Return where to write a picture, under a name of its own."""
+        stem = next(x for x in chain([stem], (f"{stem}_{n}" for n in count(2))) if x.casefold() not in taken)
+        taken.add(stem.casefold())
+        names.append(f"{stem}{suffix}")
+        return folder / names[-1]
+
     for path in sources:
         if is_video(path):
+            _log.info("%s: looking for the sharpest frame of each of %d parts", path.name, frames)
             for number, image in enumerate(sharpest_frames(path, frames)):
-                names.append(f"{path.stem}_{number:04d}.jpg")
-                _save(image, folder / names[-1])
+                _save(image, place(f"{path.stem}_{number:04d}", ".jpg"))
         elif (turned := _upright(path)) is None:
-            names.append(path.name)
-            with replacing(folder / path.name) as place:
-                shutil.copyfile(path, place)
+            with replacing(place(path.stem, path.suffix)) as copy:
+                shutil.copyfile(path, copy)
         else:
-            names.append(f"{path.stem}.jpg")
-            _save(turned, folder / names[-1])
+            _save(turned, place(path.stem, ".png" if turned.mode == "RGBA" else ".jpg"))
     return names
 
 
@@ -143,6 +196,17 @@ def _opened_video(path: Path) -> Any:
     return file
 
 
+def _check_video(path: Path) -> None:
+    """Refuse a video without a picture that can be decoded; errors are those of `sharpest_frames`."""
+    with _opened_video(path) as file:
+        try:
+            first = next(file.decode(video=0), None)
+        except (ValueError, OSError) as error:
+            raise ValueError(f"it is not a readable video: {error}") from error
+    if first is None:
+        raise ValueError("it holds no pictures")
+
+
 def _upright(path: Path) -> Any:
     """Return a photograph as a Pillow image, turned as its EXIF data say; None where the file will do as it is."""
     from PIL import ImageOps
@@ -157,13 +221,13 @@ def _upright(path: Path) -> Any:
     with opened_image(path, ("HEIF",) if kind in HEIC else FORMATS) as image:
         if kind in _AS_THEY_ARE and image.getexif().get(_ORIENTATION, 1) == 1:
             return None
-        return ImageOps.exif_transpose(image.convert("RGB"))
+        return ImageOps.exif_transpose(image.convert("RGBA" if has_alpha(image) else "RGB"))
 
 
 def _save(image: Any, path: Path) -> None:
-    """Write a picture as JPEG, with its EXIF data."""
+    """Write a picture as JPEG or PNG, with its EXIF data."""
     exif = image.getexif()
     with suppress(KeyError):
         del exif[_ORIENTATION]
     with replacing(path) as place:
-        image.save(place, "JPEG", quality=95, exif=exif)
+        image.save(place, "PNG" if path.suffix == ".png" else "JPEG", quality=95, exif=exif)

@@ -47,7 +47,7 @@ def choose_points(
 
     Raises:
         FileNotFoundError: if the file or folder is missing.
-        ValueError: if the option or a file is invalid.
+        ValueError: if a file is invalid.
     """
     kind, _, count = points.partition(":")
     if points in ("auto", "dense"):
@@ -66,8 +66,6 @@ def choose_points(
             "--test none and no --views all train; --points FOLDER --allow-test-points takes them anyway)"
         )
     if kind == "random":
-        if count and not (count.isdecimal() and int(count) > 0):
-            raise ValueError(f"points must be random or random:<count>, such as random:10000, got {points!r}.")
         cloud = random_points(train, int(count or RANDOM_POINTS), generator)
         return cloud, f"initial points: {len(cloud.positions):,} random ones"
     path = path_inside(root, points)

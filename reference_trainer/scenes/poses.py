@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing
 from dataclasses import dataclass
@@ -21,9 +21,15 @@ import numpy as np
 from reference_trainer.progress import progress_bar
 from reference_trainer.scenes._colmap_model import CAMERA_MODELS
 from reference_trainer.scenes.colmap import colmap_folders
-from reference_trainer.scenes.images import decode_image, image_size, list_images, unreadable_photographs
+from reference_trainer.scenes.images import (
+    decode_image,
+    image_size,
+    list_images,
+    photograph_folder,
+    unreadable_photographs,
+)
 
-__all__ = ["FEW", "FoundPoses", "enlarge", "feature_size", "find_poses"]
+__all__ = ["FEW", "FoundPoses", "enlarge", "feature_size", "find_poses", "left_out"]
 
 FEW = 8
 """Below this many photographs COLMAP's settings, made for dozens, are replaced."""
@@ -33,6 +39,7 @@ ENLARGED = 2
 """Fewer than `FEW` photographs that are smaller are enlarged so many times at most: several times as many features."""
 CERTAIN = 0.5
 """Pixels of error beyond which a feature counts less and less in the last bundle adjustment."""
+_LEFT_OUT = "left_out.txt"  # beside the files of the model
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,17 @@ class FoundPoses:
     error: float  # mean reprojection error of their features, pixels of the photographs
     focal: tuple[float, ...]  # focal lengths of the cameras, pixels, sorted
 
+    @property
+    def about_others(self) -> list[str]:
+        """What to do about the photographs without a camera, a line each; empty if all have one."""
+        lines = []
+        if self.left_out:
+            lines.append(
+                f"left out: {', '.join(self.left_out)}. They share too little with the others: add a photograph from "
+                "in between, or go on without them"
+            )
+        return lines + [f"not read, and left out: {why}" for why in self.unread.values()]
+
     def __str__(self) -> str:
         """Describe what was found, and what to do about photographs left out."""
         lengths = " to ".join(f"{x:.0f}" for x in dict.fromkeys((self.focal[0], self.focal[-1])))
@@ -55,13 +73,7 @@ class FoundPoses:
             f"{len(self.registered)} of {every} photographs registered: {', '.join(self.registered)}",
             f"{self.points:,} points, reprojection error {self.error:.2f} pixels, focal length {lengths} pixels",
         ]
-        if self.left_out:
-            lines.append(
-                f"left out: {', '.join(self.left_out)}. They share too little with the others: add a photograph from "
-                "in between, or go on without them"
-            )
-        lines += [f"not read, and left out: {why}" for why in self.unread.values()]
-        return "\n".join(lines)
+        return "\n".join(lines + self.about_others)
 
 
 def feature_size(width: int, height: int, *, few: bool) -> tuple[int, int]:
@@ -107,7 +119,7 @@ def find_poses(
         raise ValueError(f"there is no camera model {camera!r}; choose one of {', '.join(known)}.")
     scene = Path(scene)
     out = scene if out is None else Path(out)
-    folder = scene / "images" if (scene / "images").is_dir() else scene
+    folder = photograph_folder(scene)
     photos, unread = _sorted(folder)
     _check_number(photos, unread, folder)
     if found := colmap_folders(out):
@@ -133,16 +145,23 @@ def find_poses(
             if photo.name not in unread:
                 images.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(photo, copy)
-        _write(model, place)
-    return FoundPoses(
-        place,
-        tuple(photo.name for photo in photos if photo.name in registered),
-        tuple(photo.name for photo in photos if photo.name not in {*registered, *unread}),
-        unread,
-        model.num_points3D(),
-        model.compute_mean_reprojection_error(),
-        tuple(sorted(camera.mean_focal_length() for camera in model.cameras.values())),
-    )
+        result = FoundPoses(
+            place,
+            tuple(photo.name for photo in photos if photo.name in registered),
+            tuple(photo.name for photo in photos if photo.name not in {*registered, *unread}),
+            unread,
+            model.num_points3D(),
+            model.compute_mean_reprojection_error(),
+            tuple(sorted(camera.mean_focal_length() for camera in model.cameras.values())),
+        )
+        _write(model, place, result.about_others)
+    return result
+
+
+def left_out(scene: Path) -> list[str]:
+    """Return what `find_poses` has said about photographs of a scene without a camera, a line each."""
+    path = scene / "sparse" / "0" / _LEFT_OUT
+    return path.read_text("utf-8", errors="replace").splitlines() if path.is_file() else []
 
 
 def _sorted(folder: Path) -> tuple[list[Path], dict[str, str]]:
@@ -307,13 +326,15 @@ def _with_progress(job: Callable[..., None], database: Path, table: str, total: 
         running.result()
 
 
-def _write(model: Any, folder: Path) -> None:
-    """Write a model atomically: beside its place, then moved there."""
+def _write(model: Any, folder: Path, about: Sequence[str]) -> None:
+    """Write a model, and lines about what it leaves out, atomically: beside its place, then moved there."""
     part = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)  # left by a process that was killed
     part.mkdir(parents=True)
     try:
         model.write_binary(part)
+        if about:
+            (part / _LEFT_OUT).write_text("\n".join(about), "utf-8", errors="backslashreplace")
         os.replace(part, folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)

@@ -16,6 +16,7 @@ from subprocesses import subprocess_environment
 
 from reference_trainer.cli import main, photos
 from reference_trainer.evaluation.pictures import save_png
+from reference_trainer.render import engine
 from reference_trainer.report import page as page_module
 from reference_trainer.runs import warmup
 from reference_trainer.runs.run import load_run
@@ -191,7 +192,12 @@ def test_cameras_are_found_by_a_new_process(garden):
 
 
 @pytest.mark.parametrize(
-    ("name", "content"), [("point_cloud.ply", "ply"), ("report.html", "<p>mine"), ("scene", None), ("views", None)]
+    ("name", "content"),
+    [("point_cloud.ply", "ply"), ("report.html", "<p>mine"), ("scene", None), ("views", None)]
+    + [
+        ("photographs.json", text)
+        for text in ('{"a": 1}', '{"files": 3}', '{"frames": 2, "files": []}', "[]", "null", "")
+    ],
 )
 def test_nothing_of_somebody_else_is_overwritten(garden, tmp_path, capsys, name, content):
     (tmp_path / "out").mkdir()
@@ -214,6 +220,143 @@ def test_what_cannot_work_is_refused_at_once(garden, capsys, monkeypatch):
         assert "ca_reg[colmap]" in refused(["run", "garden"], capsys)
     assert "no nowhere" in refused(["run", "nowhere"], capsys)
     assert "--quality" in refused(["run", "garden", "--quick", "--quality"], capsys)
+
+
+@pytest.fixture
+def stopped(garden, monkeypatch):
+    """Runs end where COLMAP would begin, and return by name the pictures that it would be given."""
+    given = []
+
+    def stop(scene, **rest):
+        given[:] = [[path.name for path in sorted((scene / "images").iterdir())]]
+        raise RuntimeError("here COLMAP begins")
+
+    def run(*arguments):
+        with pytest.raises(SystemExit):
+            main(["run", *arguments])
+        return given.pop() if given else None
+
+    monkeypatch.setattr(photos, "find_spec", lambda name: name)
+    monkeypatch.setattr(photos.RenderOptions, "begin", lambda *_, **__: None)
+    monkeypatch.setattr(poses, "find_poses", stop)
+    return run
+
+
+@pytest.fixture
+def clip(tmp_path, monkeypatch):
+    """A video of twenty pictures, or as many as are left in the list; after those comes Ctrl-C, if it says so."""
+    pictures = [Image.new("RGB", (40, 30), (number, 0, 0)) for number in range(20)]
+
+    def frames(path, count):
+        for number in range(min(count, len(pictures))):
+            if pictures[number] is None:
+                raise KeyboardInterrupt
+            yield pictures[number]
+
+    (tmp_path / "clip.mp4").write_bytes(b"fake")
+    monkeypatch.setattr(photographs, "_check_video", lambda path: None)
+    monkeypatch.setattr(photographs, "sharpest_frames", frames)
+    return pictures
+
+
+def test_of_an_interrupted_collection_nothing_is_left(stopped, clip, tmp_path):
+    clip[10], whole = None, clip[10]
+    assert stopped("clip.mp4") is None
+    out = tmp_path / "runs/clip"
+    assert [path.name for path in out.rglob("*")] == [".lock"]
+    (out / ".photographs.part").mkdir()  # of one that was killed
+    (out / ".photographs.part" / "clip_0009.jpg").touch()
+    clip[10] = whole
+    assert stopped("clip.mp4", "--frames", "4") == [f"clip_000{i}.jpg" for i in range(4)]
+    assert sorted(path.name for path in out.iterdir()) == [".lock", "photographs.json", "scene"]
+
+
+def test_another_number_of_frames_matters_to_videos_alone(stopped, clip, capsys):
+    assert len(stopped("clip.mp4")) == 16
+    assert "see --frames" in refused(["run", "clip.mp4", "--frames", "4"], capsys)
+    assert len(stopped("clip.mp4", "--frames", "4", "--from", "photographs")) == 4
+    assert len(stopped("garden")) == len(stopped("garden", "--frames", "4")) == 3
+
+
+def test_a_video_with_one_picture_is_refused_and_claims_no_folder(stopped, clip, tmp_path, capsys):
+    del clip[1:]
+    for _ in range(2):
+        assert "clip.mp4 gave 1 picture; it takes at least 2" in refused(["run", "clip.mp4"], capsys)
+        assert not (tmp_path / "runs/clip/photographs.json").exists()
+
+
+def test_equal_photographs_and_other_folders_are_named(stopped, garden, tmp_path, capsys):
+    shutil.copy(garden / "train_0.png", garden / "train_3.png")
+    shutil.copytree(garden, garden / "DCIM" / "100")
+    assert stopped("garden") == ["train_0.png", "train_1.png", "train_2.png"]
+    said = capsys.readouterr().err
+    assert "left out: train_3.png is the same file as train_0.png" in said
+    assert "left out: 4 photographs or videos in garden/DCIM/100 are not read: move them to garden, or give" in said
+    (tmp_path / "card").mkdir()
+    shutil.copytree(garden / "DCIM", tmp_path / "card" / "DCIM")
+    said = refused(["run", "card"], capsys)
+    assert "in card/DCIM/100 are not read" in said
+    assert "card holds no photographs that can be read" in said
+
+
+@pytest.mark.parametrize("sign", ["sparse/0", "notes.npz"])
+def test_what_is_taken_for_cameras_and_is_none_is_no_dead_end(stopped, garden, tmp_path, capsys, sign):
+    wrong = garden / sign
+    wrong.mkdir(parents=True) if sign == "sparse/0" else np.savez(wrong, notes=np.zeros(3))
+    assert sign.partition("/")[0] in refused(["run", "garden"], capsys)
+    assert not (tmp_path / "runs").exists()
+    shutil.rmtree(garden / "sparse") if sign == "sparse/0" else wrong.unlink()
+    for _ in range(2):
+        assert len(stopped("garden")) == 3
+        shutil.rmtree(tmp_path / "runs/garden/scene/garden/images")
+
+
+def test_wrong_options_are_refused_with_everything_in_place(stopped, garden, tmp_path, capsys, monkeypatch):
+    assert stopped("garden") is not None
+    (out := tmp_path / "runs/garden").joinpath("checkpoint.pt").write_bytes(b"an hour of training")
+    (out / "results.json").write_text("{}")
+    before = seen(out)
+    monkeypatch.setattr(engine, "_compiled_engine", lambda name: None)
+    for step in ("photographs", "poses", "train"):
+        again = ["run", "garden", "--from", step]
+        for points in ("random:many", "random:0", "nowhere.ply", "../elsewhere"):
+            if step != "photographs" or points.startswith("random"):
+                assert points in refused([*again, "--points", points], capsys)
+        assert "triton needs" in refused([*again, "--engine", "triton"], capsys)
+        assert seen(out) == before
+    assert stopped("garden", "--from", "train") is not None
+    assert seen(out).keys() == {path for path in before if path.name not in ("checkpoint.pt", "results.json")}
+
+
+def test_a_folder_that_cannot_be_written_to_is_answered_with_the_option(garden, capsys, monkeypatch):
+    monkeypatch.setattr(photos.os, "access", lambda place, mode: False)
+    assert "runs/garden cannot be written to" in (said := refused(["run", "garden"], capsys))
+    assert "another --out" in said
+    (garden.parent / "file").touch()
+    assert "another --out" in refused(["run", "garden", "--out", "file/x"], capsys)
+
+
+def test_one_large_photograph_does_not_shrink_the_others_to_nothing(stopped, garden, capsys):
+    with Image.open(garden / "train_0.png") as small:
+        small.resize((400, 300)).save(garden / "train_1.png")
+    stopped("garden")
+    assert "most photographs train at 40x30, but train_1.png at 400x300." in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_photographs_that_were_not_placed_are_named_again_and_on_the_page(garden, tmp_path, capsys, monkeypatch):
+    find, said = poses.find_poses, "left out: train_9.png. They share too little with the others"
+
+    def find_two(scene, **rest):
+        find(scene, **rest)
+        (scene / "sparse/0/left_out.txt").write_text(said)
+        return f"3 of 4 photographs registered\n{said}"
+
+    monkeypatch.setattr(poses, "find_poses", find_two)
+    for times in (1, 1):
+        main(["run", "garden", "--no-open"])
+        assert capsys.readouterr().out.count(said) == times
+    assert said in (tmp_path / "runs/garden/report.html").read_text()
 
 
 def test_folders_with_a_dot_in_their_names_are_not_one(tmp_path):

@@ -133,8 +133,8 @@ def test_what_cannot_be_measured_is_refused_with_the_reason():
     noise = torch.rand(2, 3, 48, 64, generator=torch.Generator().manual_seed(0))
     elsewhere = looking(0.25, turn=math.pi, width=64, height=48, focal=60.0)
     for given, reason in (
-        (views[:1], "at least 2 training photographs, got 1"),
-        (pair(image=views[0].image), "different photographs: a and b are the same"),
+        (views[:1], "at least 2 different training photographs, got 1: choose"),
+        (pair(image=views[0].image), "at least 2 different .*, got 1 .b shows the same as a and is left out.: choose"),
         (
             [replace(view, image=torch.full((3, 48, 64), 0.3 * i)) for i, view in enumerate(views)],
             "only 0 points.*texture",
@@ -150,6 +150,17 @@ def test_what_cannot_be_measured_is_refused_with_the_reason():
             dense_points(given)
 
 
+def test_a_photograph_that_is_there_twice_does_not_count(caplog):
+    first, second = pair()
+    copy = replace(first, name="c", image=(first.image + 0.003).clamp(0, 1))  # saved again, with another camera
+    copy = replace(copy, camera=looking(-0.26, width=64, height=48, focal=60.0))
+    with caplog.at_level("INFO"):
+        cloud = dense_points([first, second, copy], count=600)
+    assert "c shows the same as a and is left out" in caplog.text
+    assert cloud.seen_by == {"a", "b"}
+    assert torch.equal(cloud.positions, dense_points([first, second], count=600).positions)
+
+
 def test_transparent_pixels_give_no_points():
     left = torch.zeros(48, 64)
     left[:, :24] = 1.0
@@ -162,6 +173,12 @@ def test_transparent_pixels_give_no_points():
 def test_source_views_are_near_but_not_too_near():
     cameras = [looking(x) for x in (0.0, 0.01, 0.8, 1.2, 30.0)]
     assert source_views(cameras, 0, 5.0) == [2, 3]  # 9 and 13 degrees apart, more overlap; 0.1 and 80 degrees
+
+
+def test_of_two_source_views_in_one_place_one_is_taken():
+    cameras = [looking(x) for x in (0.0, 1.0, 1.01, 0.5)]
+    assert source_views(cameras, 0, 5.0)[0] in (1, 2)
+    assert source_views(cameras, 0, 5.0)[1:] == [3]
 
 
 def test_aggregation_is_the_recurrence_of_semi_global_matching():
@@ -243,6 +260,13 @@ def test_few_measured_points_and_a_dense_start_are_what_a_training_begins_with_u
     assert "dense stereo, and 99 from" in str(scene)
     kept = load_scene(SceneOptions(str(tmp_path / "scene")), trains=False).points
     assert len(kept.positions) == 99  # enough for what trains nothing, and at once
+
+
+def test_a_photograph_that_is_there_twice_leaves_the_others_their_dense_start(tmp_path):
+    written(tmp_path / "scene", plane(-0.3, 0.0, 0.3, 0.3))
+    scene = load_scene(SceneOptions(str(tmp_path / "scene")))
+    assert scene.points.source == SOURCE
+    assert "measured on the 3 training photographs by dense stereo (images/3 shows the same as images/2" in str(scene)
 
 
 def test_ten_thousand_measured_points_are_enough(tmp_path, cache):

@@ -21,9 +21,9 @@ from reference_trainer import cli
 from reference_trainer.cli import main
 from reference_trainer.scenes import load_scene, poses
 from reference_trainer.scenes.colmap import read_colmap
-from reference_trainer.scenes.images import image_size
+from reference_trainer.scenes.images import image_size, picture_folder
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.scenes.poses import _write, find_poses
+from reference_trainer.scenes.poses import _write, find_poses, left_out
 
 
 @pytest.fixture
@@ -177,6 +177,25 @@ def test_photographs_that_cannot_be_read_are_left_out_and_all_are_named(noise, t
     assert sorted(path.name for path in (tmp_path / "scene/images").iterdir()) == ["0.png", "1.png", "2.png"]
 
 
+def test_what_was_left_out_is_kept_beside_the_model(noise, monkeypatch):
+    placed = reconstruction()
+    placed.images.pop(2)
+    monkeypatch.setattr(poses, "_reconstruct", lambda *_: placed)
+    cut_off(noise / "3.jpg")
+    said = str(find_poses(noise)).splitlines()
+    assert said[2].startswith("left out: 2.png. ")
+    assert left_out(noise) == said[2:]
+    assert len(said) == 4
+    assert left_out(noise / "elsewhere") == []
+
+
+def test_photographs_beside_an_empty_folder_images_are_found(noise, monkeypatch):
+    (noise / "images").mkdir()
+    monkeypatch.setattr(poses, "_reconstruct", lambda *_: reconstruction())
+    assert find_poses(noise).registered == ("0.png", "1.png", "2.png")
+    assert picture_folder(noise, None) == noise  # where a training looks for them
+
+
 def test_what_only_colmap_cannot_read_is_left_out_too(noise, monkeypatch):
     pycolmap = pytest.importorskip("pycolmap", reason="needs ca_reg[colmap]")
     Image.new("RGB", (40, 30)).save(noise / "3.webp")
@@ -305,12 +324,12 @@ class Model:
 def test_a_model_is_written_whole_or_not_at_all(tmp_path):
     folder = tmp_path / "sparse" / "0"
     with pytest.raises(OSError, match="No space left"):
-        _write(Model(fails=True), folder)
+        _write(Model(fails=True), folder, [])
     assert not any((tmp_path / "sparse").iterdir())
     killed = tmp_path / "sparse" / ".0.part"  # of a process that had no time to clean up
     killed.mkdir()
     (killed / "points3D.bin").write_bytes(b"old")
-    _write(Model(fails=False), folder)
+    _write(Model(fails=False), folder, [])
     assert {path.name for path in folder.iterdir()} == {"cameras.bin", "images.bin"}
     assert not killed.exists()
 
