@@ -322,7 +322,7 @@ def test_wrong_options_are_refused_with_everything_in_place(stopped, garden, tmp
         for points in ("random:many", "random:0", "nowhere.ply", "../elsewhere"):
             if step != "photographs" or points.startswith("random"):
                 assert points in refused([*again, "--points", points], capsys)
-        assert "triton needs" in refused([*again, "--engine", "triton"], capsys)
+        assert "the engine triton" in refused([*again, "--engine", "triton"], capsys)
         assert seen(out) == before
     assert stopped("garden", "--from", "train") is not None
     assert seen(out).keys() == {path for path in before if path.name not in ("checkpoint.pt", "results.json")}

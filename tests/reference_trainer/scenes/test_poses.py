@@ -21,7 +21,7 @@ from reference_trainer import cli
 from reference_trainer.cli import main
 from reference_trainer.scenes import load_scene, poses
 from reference_trainer.scenes.colmap import read_colmap
-from reference_trainer.scenes.images import image_size, picture_folder
+from reference_trainer.scenes.images import image_folder, image_size
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.poses import _write, find_poses, left_out
 
@@ -193,7 +193,7 @@ def test_photographs_beside_an_empty_folder_images_are_found(noise, monkeypatch)
     (noise / "images").mkdir()
     monkeypatch.setattr(poses, "_reconstruct", lambda *_: reconstruction())
     assert find_poses(noise).registered == ("0.png", "1.png", "2.png")
-    assert picture_folder(noise, None) == noise  # where a training looks for them
+    assert image_folder(noise, None) == noise  # where a training looks for them
 
 
 def test_what_only_colmap_cannot_read_is_left_out_too(noise, monkeypatch):
