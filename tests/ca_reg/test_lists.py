@@ -119,7 +119,7 @@ def test_chunks_of_any_size_give_the_same(monkeypatch):
     scene, per_gaussian, weights = dense(), MULTIPLIERS["(N,)"], uniform(3, HEIGHT, WIDTH)
     moments, found = ListMoments(scene.lists), []
     for least in (1, 1000):
-        monkeypatch.setattr("ca_reg.lists._CHUNK", least)
+        monkeypatch.setattr("ca_reg.lists.CHUNK_ENTRIES", least)
         shares = moments.shares(scene.opacity, None, per_gaussian, None, weights)
         found.append((*moments(scene.opacity, None, per_gaussian, None), shares))
     for a, b in zip(*found, strict=True):
@@ -243,7 +243,7 @@ def test_lists_by_brute_force_agree_with_the_renderer():
 
 
 def test_gradients(monkeypatch):
-    monkeypatch.setattr("ca_reg.lists._CHUNK", 1)
+    monkeypatch.setattr("ca_reg.lists.CHUNK_ENTRIES", 1)
     scene = dense(seed=1)
 
     def f(opacity, colors, background, mean, variance):
@@ -289,13 +289,13 @@ def test_lists_are_checked(change, error, match):
 def test_arguments_are_checked():
     scene = padded()
     moments = ListMoments(scene.lists)
-    with pytest.raises(ValueError, match="opacity must have shape"):
+    with pytest.raises(ValueError, match=r"opacity .*shape"):
         moments(scene.opacity[None, :], None, DROPOUT, None)
     with pytest.raises(ValueError, match="channels first"):
         moments(scene.opacity, None, DROPOUT, torch.zeros(HEIGHT, WIDTH, 3))
-    with pytest.raises(ValueError, match="variance of the multiplier must be a number or have shape"):
+    with pytest.raises(ValueError, match=r"variance .*multiplier .*shape"):
         moments(scene.opacity, None, Multiplier(1.0, torch.ones(N + 1)), None)
-    with pytest.raises(ValueError, match=r"weights must have the shape of the image, \(3, 5\)"):
+    with pytest.raises(ValueError, match=r"weights .*\(3, 5\)"):
         moments.shares(scene.opacity, None, DROPOUT, None, torch.ones(WIDTH, HEIGHT))
-    with pytest.raises(TypeError, match=r"must return ca_reg\.lists\.PixelLists, got tuple"):
+    with pytest.raises(TypeError, match=r"ca_reg\.lists\.PixelLists, got tuple"):
         ListMoments(lambda o, v: tuple(scene.lists(o, v)))(scene.opacity, None, DROPOUT, None)
