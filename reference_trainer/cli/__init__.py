@@ -32,19 +32,19 @@ from reference_trainer.devices import check_device
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES, with_recipe
 
-__all__ = ["main"]
+__all__ = ["log_shown", "main", "parse_command"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``ca-reg``; errors that a user can fix exit with one line and code 2, an interruption with 130."""
     arguments = (sys.argv[1:] if arguments is None else list(arguments)) or ["--help"]
-    with _log_shown():
+    with log_shown():
         _run(arguments)
 
 
 def _run(arguments: Sequence[str]) -> None:
     try:
-        command = _parse(arguments)
+        command = parse_command(arguments)
         computing = command.what if isinstance(command, Study) else command
         if hasattr(computing, "check"):  # refuses what cannot work, before anything heavy is imported
             computing.check()
@@ -79,7 +79,7 @@ class _Shown(logging.Handler):
 
 
 @contextmanager
-def _log_shown() -> Iterator[None]:
+def log_shown() -> Iterator[None]:
     """Show the messages of the trainer, and warnings of other packages, while a command runs."""
     root, trainer, shown = logging.getLogger(), logging.getLogger("reference_trainer"), _Shown()
     level = trainer.level
@@ -92,7 +92,7 @@ def _log_shown() -> Iterator[None]:
         trainer.setLevel(level)
 
 
-def _parse(arguments: Sequence[str]) -> Any:
+def parse_command(arguments: Sequence[str]) -> Any:
     """Return the command with its options; exits if they cannot be parsed."""
     if arguments[:1] == ["study"] and (moved := MOVED.get("".join(arguments[1:2]))):
         raise ValueError(f"study {arguments[1]} is now {moved}, called from a checkout of the repository.")

@@ -169,7 +169,7 @@ class Trainer:
             for model in self.models:
                 model.density.before_step(model.optimizer, self.step)
             self.density.together(self.models, self.step)
-            steps = self._begin_steps()
+            steps = self.begin_steps()
             for step in steps:
                 if self.config.analytic and len(step.regularizer):
                     step.expect()
@@ -293,7 +293,7 @@ class Trainer:
                 _log.info("step %d: %s", self.step, found)
                 model.density.select(model.optimizer, found.keep)
 
-    def _begin_steps(self) -> list[Step]:
+    def begin_steps(self) -> list[Step]:
         """Choose the view of the step and what regularizes it; return a `Step` for every model."""
         begun, steps, background = self.step >= self.config.regularize_from, list[Step](), self.background
         if self.config.random_background:
