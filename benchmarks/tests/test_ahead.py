@@ -15,7 +15,7 @@ from subprocesses import subprocess_environment
 
 pytest.importorskip("triton")
 pytest.importorskip("scipy")
-ROOT = Path(__file__).parents[4]
+ROOT = Path(__file__).parents[2]
 
 
 def run(*arguments):
@@ -30,7 +30,6 @@ def compiled(code):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("target", "registers"), [("sm_75", 128), ("sm_120", 128), ("gfx90a", 256), ("gfx1201", 256)])
 def test_nothing_spills(target, registers):
     """The projections of one and two bands lie between those of none and of three, and took a quarter of the time."""
@@ -43,14 +42,12 @@ def test_nothing_spills(target, registers):
     assert all(15 < row["per_entry"] < row["instructions"] for row in rows if row["per_entry"] is not None)
 
 
-@pytest.mark.slow
 def test_a_spill_is_seen():
     """With fewer registers than the kernel needs."""
     kernel = "next(k for k in KERNELS if k.label == 'composite backward')"
     assert compiled(f"compile_ahead({kernel}, 'sm_90', maxnreg=24).spills") > 0
 
 
-@pytest.mark.slow
 def test_the_command_says_what_it_cannot_compile():
     done = run("-m", "benchmarks.gpu", "ahead", "sm_10")
     assert done.returncode == 1
