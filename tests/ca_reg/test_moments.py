@@ -399,13 +399,13 @@ def test_wrong_arguments_are_refused(change, error, message):
 def test_colors_that_are_not_finite_are_refused_in_the_padding_too(function, bad):
     alphas, colors, _ = lists(3, 5)
     alphas[1, 4], colors[1, 4, 2] = 0.0, bad
-    with pytest.raises(ValueError, match="colors must be finite"):
+    with pytest.raises(ValueError, match=r"colors .*finite"):
         function(alphas, colors, Multiplier.dropout(0.3))
 
 
 def test_a_background_that_is_not_finite_is_refused():
     alphas, colors, _ = lists(3, 5)
-    with pytest.raises(ValueError, match="background must be finite"):
+    with pytest.raises(ValueError, match=r"background .*finite"):
         pixel_moments(alphas, colors, Multiplier.dropout(0.3), background=torch.tensor([0.0, math.nan, 0.0]).double())
 
 
@@ -416,5 +416,5 @@ def test_finite_colors_whose_sum_overflows_are_no_mistake():
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_short_dtypes_are_refused(dtype):
-    with pytest.raises(TypeError, match=r"float32 or float64, got torch\.b?float16; convert it with \.float"):
+    with pytest.raises(TypeError, match=r"got torch\.b?float16; .*\.float"):
         alpha_moments(torch.full((5,), 0.5, dtype=dtype), Multiplier.dropout(0.5))

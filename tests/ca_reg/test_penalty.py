@@ -229,7 +229,7 @@ def test_wrong_calls_are_refused():
     dropout = Multiplier.dropout(0.2)
     with pytest.raises(ValueError, match="sigmoid"):
         CAPenalty(cloud.moments, dropout)(torch.tensor([-1.0, 0.5, 0.5, 0.5, 0.5]).double(), cloud.colors)
-    with pytest.raises(TypeError, match="must return a Multiplier"):
+    with pytest.raises(TypeError, match="return a Multiplier"):
         CAPenalty(cloud.moments, lambda o: o)(cloud.opacity, cloud.colors)
     with pytest.raises(TypeError, match="without variance"):
         CAPenalty(lambda *_: {"mean": cloud.target, "alpha_mean": cloud.target[0]}, dropout)(cloud.opacity, None)

@@ -82,7 +82,7 @@ def test_a_name_is_entered_once():
     registry = Registry("animal", object)
     registry.register("cat")(dict)
     registry.register("cat")(dict)
-    with pytest.raises(ValueError, match="there is a animal 'cat' already"):
+    with pytest.raises(ValueError, match="animal 'cat' already"):
         registry.register("cat")(list)
 
 

@@ -217,7 +217,7 @@ def test_methods_are_not_averaged_with_one_another():
         CAScore.exact(model.moments, neutral=True, threshold=THRESHOLD),
     ]
     for pair in itertools.combinations([score(model.opacity, None) for score in scores], 2):
-        with pytest.raises(ValueError, match="one set of settings, got 2"):
+        with pytest.raises(ValueError, match=r"one set .*got 2"):
             summarize(pair)
 
 

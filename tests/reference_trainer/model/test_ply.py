@@ -223,7 +223,7 @@ def test_damaged_files(tmp_path, content, message):
 @pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.KSPLAT", "a.sog"])
 def test_compressed_formats_say_what_to_do(tmp_path, name):
     (tmp_path / name).write_bytes(b"\x1f\x8b anything")
-    with pytest.raises(ValueError, match=r"is a compressed format.*give the PLY that it was made from"):
+    with pytest.raises(ValueError, match=r"compressed format.*PLY"):
         load_ply(tmp_path / name)
 
 
@@ -231,7 +231,7 @@ def test_a_compressed_ply_says_what_to_do(tmp_path):
     lines = ["ply", "format binary_little_endian 1.0", "element chunk 1", "property float min_x"]
     lines += ["element vertex 1", "property uint packed_position", "end_header", ""]
     (tmp_path / "a.compressed.ply").write_bytes("\n".join(lines).encode() + bytes(8))
-    with pytest.raises(ValueError, match=r"is a compressed PLY.*give the PLY that it was made from"):
+    with pytest.raises(ValueError, match=r"compressed PLY.*made from"):
         load_ply(tmp_path / "a.compressed.ply")
 
 

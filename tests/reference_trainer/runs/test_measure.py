@@ -68,7 +68,7 @@ def test_noise_alone_has_a_ply_for_viewers_too(options, tmp_path):
 
 
 def test_a_run_is_not_rendered_as_if_trained_with_nonsense(run):
-    with pytest.raises(ValueError, match="there is no regularizer 'noize'"):
+    with pytest.raises(ValueError, match="no regularizer 'noize'"):
         load_run_model(run[0], regularizer="noize(0.8)")
 
 
@@ -120,7 +120,7 @@ def test_the_folder_is_locked_until_the_last_file_has_changed(run, tmp_path, mon
 def test_an_evaluation_tells_what_hangs_where_it_can_tell(run, said):
     model, scene = load_run_model(run[0])
     log_what_hangs(model, scene)
-    assert any("where nobody took a photograph" in text for text in said)
+    assert any("nobody took a photograph" in text for text in said)
     count = len(said)
     log_what_hangs(dataclasses.replace(model, regularizer=""), scene)  # a plain model is not guarded
     log_what_hangs(model, None)

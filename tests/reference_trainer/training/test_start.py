@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 
 import pytest
 import torch
@@ -124,7 +125,7 @@ def test_from_the_command_line(ply, tmp_path, capsys, monkeypatch, command):
     assert len(trained.gaussians) == 60
     assert (trained.gaussians.means - model().means).abs().max() < 0.05
     if command == "train":
-        assert "starts from the 60 Gaussians of degree 2 in point_cloud.ply" in capsys.readouterr().out
+        assert re.search(r"60 Gaussians of degree 2 .*point_cloud\.ply", capsys.readouterr().out)
         main(arguments)
         assert "complete, nothing to do" in capsys.readouterr().out
 
@@ -151,7 +152,7 @@ def test_what_is_no_start(tmp_path, write, message):
 
 
 def test_no_file_and_two_starts(ply):
-    with pytest.raises(FileNotFoundError, match=r"there is no model nowhere\.ply to start from"):
+    with pytest.raises(FileNotFoundError, match=r"no model nowhere\.ply"):
         scene_with("nowhere.ply")
-    with pytest.raises(ValueError, match="init takes the place of points: leave out one of"):
+    with pytest.raises(ValueError, match=r"init .*points: leave out"):
         load_scene(SceneOptions("synthetic", init=str(ply), points="random"))

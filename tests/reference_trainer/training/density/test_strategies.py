@@ -66,7 +66,7 @@ def test_gaussians_that_are_not_numbers_stop_the_training_and_are_said_to(tiny_s
     trainer.train(until=6)
     with torch.no_grad():
         getattr(trainer.models[-1].gaussians, name)[0] = math.nan
-    with pytest.raises(TrainingStoppedError, match=r"finite|nan or infinite by step 6"):
+    with pytest.raises(TrainingStoppedError, match=r"finite|nan .*step 6"):
         trainer.train()
 
 
@@ -115,5 +115,5 @@ def test_bad_arguments_are_refused(expression, message):
     ],
 )
 def test_counts_are_integers(expression, name):
-    with pytest.raises(ValueError, match=rf"^{re.escape(repr(expression))}: {name} must be an integer, got float"):
+    with pytest.raises(ValueError, match=f"^{re.escape(repr(expression))}: {name} .*integer, got float"):
         check(TrainConfig(density=expression))

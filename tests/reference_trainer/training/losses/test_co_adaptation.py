@@ -132,5 +132,5 @@ def test_bad_arguments(text, message):
 
 def test_a_single_photograph_has_no_views_between(tiny_scene):
     (term,) = LOSSES.make("co_adaptation(where='arc')")
-    with pytest.raises(ValueError, match="between two training cameras, and 'synthetic' has 1"):
+    with pytest.raises(ValueError, match=r"two .*cameras, .*'synthetic' has 1"):
         term.begin(dataclasses.replace(tiny_scene, train=tiny_scene.train[:1]))
