@@ -204,8 +204,8 @@ def test_a_study_leaves_numbers_tables_and_a_figure(trained, tmp_path):
         assert len(picture.convert("RGB").getcolors(1 << 24)) > 50
 
 
-@pytest.mark.parametrize(("keywords", "message"), [({"split": "val"}, "split must be 'train' or 'test', got 'val'"),
-                                                    ({"views": 0}, "views must be at least 1")])  # fmt: skip
+@pytest.mark.parametrize(("keywords", "message"), [({"split": "val"}, "split .*'train' or 'test', got 'val'"),
+                                                    ({"views": 0}, "views .*at least 1")])  # fmt: skip
 def test_refusals(trained, keywords, message):
     with pytest.raises(ValueError, match=message):
         ranking_study(trained[0], **keywords)

@@ -263,19 +263,19 @@ def test_the_callable_itself_is_checked():
 @pytest.mark.parametrize(
     ("change", "error", "match"),
     [
-        ({"gaussians": torch.tensor([0.0, 1.0])}, TypeError, "gaussians of the lists must be int64 or int32"),
-        ({"gaussians": torch.tensor([0, 2])}, ValueError, r"gaussians of the lists must be in \[0, 2\), got .* 0 to 2"),
+        ({"gaussians": torch.tensor([0.0, 1.0])}, TypeError, "gaussians .*int64 or int32"),
+        ({"gaussians": torch.tensor([0, 2])}, ValueError, r"gaussians .*\[0, 2\), got .* 0 to 2"),
         ({"gaussians": torch.tensor([-1, 1])}, ValueError, r"in \[0, 2\), got values from -1 to 1"),
-        ({"pixels": torch.tensor([0, 6])}, ValueError, r"pixels of the lists must be in \[0, 6\)"),
-        ({"pixels": torch.tensor([0])}, ValueError, r"pixels of the lists must have the shape of alphas, \(2,\)"),
+        ({"pixels": torch.tensor([0, 6])}, ValueError, r"pixels .*\[0, 6\)"),
+        ({"pixels": torch.tensor([0])}, ValueError, r"pixels .*shape of alphas, \(2,\)"),
         ({"alphas": torch.tensor([0.5, 1.5])}, ValueError, r"alphas must be in \[0, 1\]"),
-        ({"alphas": torch.ones(2, 1)}, ValueError, r"alphas of the lists must have shape \(P,\)"),
+        ({"alphas": torch.ones(2, 1)}, ValueError, r"alphas .*shape \(P,\)"),
         ({"alphas": torch.ones(2).double()}, TypeError, "same dtype"),
-        ({"colors": torch.ones(3, 3)}, ValueError, r"colors of the lists must have shape \(2, 3\)"),
-        ({"height": 0}, ValueError, "height must be at least 1"),
+        ({"colors": torch.ones(3, 3)}, ValueError, r"colors .*shape \(2, 3\)"),
+        ({"height": 0}, ValueError, "height .*at least 1"),
         ({"background": torch.tensor([0.0, torch.nan, 0.0])}, ValueError, "background must be finite"),
         ({"colors": torch.tensor([[0.5] * 3, [torch.inf] * 3])}, ValueError, "colors must be finite"),
-        ({"background": torch.ones(4)}, ValueError, r"background must have shape \(3,\) or \(3, 2, 3\)"),
+        ({"background": torch.ones(4)}, ValueError, r"background .*shape \(3,\) or \(3, 2, 3\)"),
     ],
 )
 def test_lists_are_checked(change, error, match):

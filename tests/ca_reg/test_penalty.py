@@ -212,10 +212,10 @@ def test_printing_shows_the_arguments():
     [
         ({"moments_fn": None}, TypeError, "moments_fn must be callable"),
         ({"multiplier": 0.2}, TypeError, "Multiplier.dropout"),
-        ({"weight": -1.0}, ValueError, "weight must be finite and at least 0"),
-        ({"weight": Constant(-1.0)}, ValueError, "weight must be finite and at least 0"),
-        ({"weight": "1"}, TypeError, "weight must be a real number"),
-        ({"layout": "WHC"}, ValueError, "layout must be one of"),
+        ({"weight": -1.0}, ValueError, "weight .*at least 0"),
+        ({"weight": Constant(-1.0)}, ValueError, "weight .*at least 0"),
+        ({"weight": "1"}, TypeError, "weight .*real number"),
+        ({"layout": "WHC"}, ValueError, "layout .*one of"),
     ],
 )
 def test_wrong_arguments_are_refused_at_construction(change, error, message):

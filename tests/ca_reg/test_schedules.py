@@ -50,7 +50,7 @@ def test_numbers_become_constants_and_callables_stay():
         (lambda: LinearRamp(0.0, 0.2, 10, 10), "must come after"),
         (lambda: ExponentialDecay(0.2, 0.1, 10, 10), "must come after"),
         (lambda: ExponentialDecay(0.2, 0.0, 0, 10), "above 0"),
-        (lambda: ExponentialDecay(10**400, 0.1, 0, 10), "value must be finite, got 1000"),
+        (lambda: ExponentialDecay(10**400, 0.1, 0, 10), "value .*finite, got 1000"),
         (lambda: LinearRamp(0.0, 0.2, -1, 10), "at least 0"),
         (lambda: StartStop(0.2, start=5, stop=5), "must come after"),
     ],

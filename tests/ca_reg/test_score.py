@@ -260,13 +260,13 @@ def test_wrong_opacities_are_refused():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"samples": 1}, "samples must be at least 2"),
+        ({"samples": 1}, "samples .*at least 2"),
         ({"p": 1.0}, "p must be in"),
         ({"drop_rate": 1.0}, "drop_rate must be in"),
         ({"samples": 3, "ddof": 3}, "ddof must be below"),
         ({"threshold": math.nan}, "threshold must be finite"),
-        ({"layout": "WHC"}, "layout must be one of"),
-        ({"seed": -1}, "seed must be at least 0"),
+        ({"layout": "WHC"}, "layout .*one of"),
+        ({"seed": -1}, "seed .*at least 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(arguments, message):

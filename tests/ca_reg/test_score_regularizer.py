@@ -142,7 +142,7 @@ def test_the_protocol_is_the_score_of_uniform_dropout():
 @pytest.mark.parametrize(
     ("make", "arguments", "message"),
     [
-        (CAScore, {"regularizer": ByDepth(), "p": 0.2}, "do not apply to the draws of a regularizer"),
+        (CAScore, {"regularizer": ByDepth(), "p": 0.2}, "draws of a regularizer"),
         (CAScore, {"regularizer": ByDepth(), "drop_rate": 0.5}, "do not apply"),
         (CAScore, {"regularizer": ByDepth()}, r"ByDepth needs means .* Params\(opacities, means"),
         (CAScore.adaptive, {"regularizer": Pair(), "relative_error": 0.1}, r"sample with CAScore\(render_fn\)"),

@@ -191,7 +191,7 @@ def test_a_missing_property_is_named(tmp_path, name):
         (b"\x89PNG\r\n", "not a PLY"),
         (b"ply\n" + b"comment x\n" * 10_000, "first 65536 bytes"),
         (b"ply\n" + b"x" * 200_000, "first 65536 bytes"),
-        (write_ascii_header(BASE, 1), "cut short: 1 vertices need 56 bytes after the header, 0 are there"),
+        (write_ascii_header(BASE, 1), "cut short: 1 vertices need 56 bytes .* 0 "),
         (write_ascii_header(BASE, 10**15) + bytes(56), "cut short"),
         (write_ascii_header(BASE, 10**15, "ascii") + b"1 2 3\n", "cut short"),
         (write_ascii_header(BASE, -1), "count"),

@@ -95,7 +95,7 @@ def test_file_split_picks_the_list(tmp_path, content, views, train):
         ('{"train": ["001.png"], "test": ["000.png"]}', 2, "no training set of 2 views; it has {'train': 1}"),
         ('{"train": ["009.png"], "test": ["000.png"]}', None, "names the image '009.png'"),
         ('{"train": ["001.png", "001"], "test": ["000.png"]}', None, "twice"),
-        ('{"train": ["001.png"], "test": ["001.png"]}', None, "both to train and to test"),
+        ('{"train": ["001.png"], "test": ["001.png"]}', None, "both to train"),
     ],
 )
 def test_file_split_says_what_is_wrong(tmp_path, text, views, reason):

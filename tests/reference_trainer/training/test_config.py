@@ -117,10 +117,10 @@ def test_a_rate_of_numpy_is_written_like_one_of_python():
     ("settings", "message"),
     [
         ({"regularizer": "dropout"}, "missing 1 required positional argument"),
-        ({"loss": ""}, "loss needs at least one term"),
+        ({"loss": ""}, "at least one term"),
         ({"loss": "photometric(2.0)"}, "lambda_dssim must lie in"),
-        ({"loss": "co_adaptation(-1.0)"}, "weight must not be negative"),
-        ({"density": "adaptive + adaptive"}, "expected one density strategy, got 2"),
+        ({"loss": "co_adaptation(-1.0)"}, "weight .*negative"),
+        ({"density": "adaptive + adaptive"}, "one density strategy, got 2"),
         ({"renderer": ""}, "expected one renderer, got 0"),
     ],
 )

@@ -138,10 +138,10 @@ def plain_cloud(path):
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (plain_cloud, "points are for --points: .* is not a 3D Gaussian Splatting PLY: its vertices lack f_dc_0"),
-        (lambda path: path.write_text("no"), "points are for --points: .* is not a PLY file"),
-        (lambda path: save_ply(model(), path, bake_p=0.2), "holds opacities of the test, not the plain ones: give"),
-        (lambda path: save_ply(model(), path, opacities=torch.rand(60)), "holds opacities of the test"),
+        (plain_cloud, "for --points: .* not a 3D Gaussian Splatting PLY: its vertices lack f_dc_0"),
+        (lambda path: path.write_text("no"), "for --points: .* not a PLY file"),
+        (lambda path: save_ply(model(), path, bake_p=0.2), "holds opacities of the test, not the plain ones"),
+        (lambda path: save_ply(model(), path, opacities=torch.rand(60)), "opacities of the test"),
         (lambda path: save_ply(model()[:0], path), "holds no Gaussians"),
     ],
 )

@@ -99,9 +99,7 @@ def test_a_second_ctrl_c_does_not_wait(tiny_scene, monkeypatch):
     assert trainer.step == 0
 
 
-@pytest.mark.parametrize(
-    ("steps", "said"), [(3, "step 4 cannot be rendered: means must be finite"), (4, "nan or infinite by step 4")]
-)
+@pytest.mark.parametrize(("steps", "said"), [(3, "step 4 .*means .*finite"), (4, "infinite by step 4")])
 def test_gaussians_that_are_not_numbers_stop_before_anything_is_pruned(tiny_scene, steps, said):
     trainer = Trainer(tiny_scene, TrainConfig(iterations=9, densify_from=1, densify_every=4))
     trainer.train(until=steps)
