@@ -1,5 +1,6 @@
 """Tiny scenes and schedules, as for the tests of the trainer; all tests of the evidence are in the slow tier."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from tiny import short as short
 from tiny import tiny_scene as tiny_scene
 
 HERE = Path(__file__).parent
+collect_ignore = ["ahead.py"] if find_spec("triton") is None else []  # it compiles kernels, at their import
 
 
 def pytest_collection_modifyitems(items):

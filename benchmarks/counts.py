@@ -44,6 +44,7 @@ __all__ = [
     "count_exact_score",
     "count_lists",
     "count_step",
+    "counted",
     "counts_table",
     "lists_table",
 ]
@@ -198,7 +199,7 @@ def _outside_of_kernels(mode: _Operations) -> Any:
         interpreter.GridExecutor.__call__ = run
 
 
-def _counted(work: Callable[[], Any]) -> tuple[int, _Operations, Any]:
+def counted(work: Callable[[], Any]) -> tuple[int, _Operations, Any]:
     """Return the launches of a call, what was counted, and what it returned."""
     from reference_trainer.render.triton import tiles
 
@@ -225,8 +226,8 @@ def count_exact_score(count: int, width: int, scale: float, device: torch.device
         lists = splats.engine.bin(projected, width, width, lambda numbers: None)
         return splats.engine.moments(Splats(*projected[:4], lists, splats.engine), multiplier, background)
 
-    operations, mode, _ = _counted(score)
-    return Counts(operations, _counted(rendering)[0], mode.read_backs, len(splats.lists.gaussians))
+    operations, mode, _ = counted(score)
+    return Counts(operations, counted(rendering)[0], mode.read_backs, len(splats.lists.gaussians))
 
 
 class StepCounts(NamedTuple):
@@ -248,9 +249,9 @@ def count_step(device: torch.device | str = "cpu", **settings: Any) -> StepCount
     trainer.train_step()  # loads what is loaded once
     photograph = scene.train[0].image.to(device)
     image = (photograph / 2).requires_grad_()
-    loss, _, _ = _counted(lambda: photometric_loss(image, photograph).backward())
+    loss, _, _ = counted(lambda: photometric_loss(image, photograph).backward())
     begun = tiles.LAUNCHED["adam"]
-    everything, mode, _ = _counted(trainer.train_step)
+    everything, mode, _ = counted(trainer.train_step)
     optimizer = tiles.LAUNCHED["adam"] - begun
     return StepCounts(everything - optimizer, loss, optimizer, mode.read_backs)
 
@@ -268,7 +269,7 @@ def bytes_per_entry(device: torch.device | str = "cpu") -> float:
         inputs = dict(zip(("means", "quaternions", "scales", "opacities", "colors"), model.tensors, strict=True))
         engine = engine_for(torch.device(device))
         projected = engine.project(inputs, model.camera, None)
-        _, mode, lists = _counted(partial(engine.bin, projected, 64, 64, lambda numbers: None))
+        _, mode, lists = counted(partial(engine.bin, projected, 64, 64, lambda numbers: None))
         peaks.append(mode.peak)
         entries.append(len(lists.gaussians))
     return (peaks[1] - peaks[0]) / (entries[1] - entries[0])

@@ -378,7 +378,7 @@ def measure_growth(
             return {"skipped": reason}
         else:
             print(f"{name}: {spec.gaussians} Gaussians, {spec.width}x{spec.height}")
-            measured[name] = {"settings": wanted, **_measure(spec, engines, repeats=repeats, device=place)}
+            measured[name] = {"settings": wanted, **measure_workload(spec, engines, repeats=repeats, device=place)}
             write_json(file, {"measured": measured})
         return {key: value for key, value in measured[name].items() if key != "settings"}
 
@@ -430,7 +430,9 @@ def extrapolated(seconds: Mapping[float, float], x: float) -> float:
     return float(seconds[last] * (x / last) ** exponent)
 
 
-def _measure(spec: WorkloadSpec, engines: Sequence[str], *, repeats: int, device: torch.device) -> dict[str, Any]:
+def measure_workload(
+    spec: WorkloadSpec, engines: Sequence[str], *, repeats: int, device: torch.device
+) -> dict[str, Any]:
     """Measure times and memory of a workload, rendered by every engine."""
     workload = spec.make().to(device)
     calls = {

@@ -1,8 +1,9 @@
-"""How large the code and its pages are, and whether it has floors: ``python -m benchmarks.house [ROOT] [--walk]``.
+"""How large the code and its pages are, and whether it has floors: ``python -m benchmarks.house [ROOT]``.
 
 Prints one table for the packages that are installed, one of how densely each of their folders is commented, and one for
 the whole; then a circle of imports, if there is one, and every import of a higher floor. With ``--walk`` it prints
-instead what a stranger opens and reads, see house.md.
+instead what a stranger opens and reads, see house.md; with ``--tests`` how often the tests pin wording and private
+names.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from pathlib import Path
 from reference_trainer.evaluation.tables import markdown_table
 from tests.floors import circle, import_graph, sources, upward
 
-__all__ = ["WALKS", "comments_and_code", "main", "walked"]
+__all__ = ["PINNED", "WALKS", "comments_and_code", "main", "pinned", "tests", "walked"]
 
 PRAGMA = re.compile(r"(\s*#\s*(fmt: \w+|noqa(: [A-Z]+\d+(, ?[A-Z]+\d+)*)?|type: ignore(\[[\w, -]+\])?))+")
 """What a comment for the linters looks like; one that goes on to give its reason is a comment for people too."""
@@ -77,6 +78,55 @@ def walked(root: Path) -> list[dict[str, object]]:
             places.append(f"{file}:{last + 1}")
         rows.append({"from the README to": goal, "files": len(way), "lines read": read, "where": ", ".join(places)})
     return rows
+
+
+PINNED = {"matches of 4 words": 54, "matches of 6 words": 2, "asserts on 5 words": 45, "reads of private names": 41,
+          "imports of private names": 27, "patches of private names": 4}  # fmt: skip
+"""What the tests pin that a user does not see, with the most that is allowed: lower these when the tests improve."""
+
+
+def _words(node: ast.AST) -> int:
+    """Count the words of a string, or pattern, and not what is quoted in it, nor names of files, options or code."""
+    text = " ".join(x.value for x in ast.walk(node) if isinstance(x, ast.Constant) and isinstance(x.value, str))
+    return len(re.findall(r"(?<![\w\\./'=-])[A-Za-z]+(?![\w\\/=-]|\.\w)", text))
+
+
+def _private(name: str) -> bool:
+    public = ("__", "_replace", "_fields", "_asdict")  # the last three are those of named tuples
+    return any(part.startswith("_") and not part.startswith(public) for part in name.split("."))
+
+
+def pinned(sources: Iterable[str]) -> dict[str, int]:
+    """Count in the sources of tests what `PINNED` limits; a private module of another package counts too.
+
+    Example:
+        >>> pinned(['assert "one of the five words" in text', "from a import _b"])["asserts on 5 words"]
+        1
+    """
+    counts = dict.fromkeys(PINNED, 0)
+    for node in (node for source in sources for node in ast.walk(ast.parse(source))):
+        match node:
+            case ast.keyword(arg="match", value=text):
+                counts["matches of 4 words"] += _words(text) >= 4
+                counts["matches of 6 words"] += _words(text) >= 6
+            case ast.Assert(test=test):
+                counts["asserts on 5 words"] += any(
+                    _words(x) >= 5 for x in ast.walk(test) if isinstance(x, ast.Constant | ast.JoinedStr)
+                )
+            case ast.Attribute(value=owner, attr=name):
+                counts["reads of private names"] += _private(name) and ast.unparse(owner) != "self"
+            case ast.ImportFrom(module=module, names=names):
+                counts["imports of private names"] += sum(_private(f"{module}.{x.name}") for x in names)
+            case ast.Call(func=ast.Attribute(attr="setattr" | "delattr" | "setitem"), args=[*args]):
+                texts = [x.value for x in args[:2] if isinstance(x, ast.Constant) and isinstance(x.value, str)]
+                counts["patches of private names"] += any(map(_private, texts))
+    return counts
+
+
+def tests(root: Path) -> list[str]:
+    """Return the sources of all tests, of the product and of the evidence."""
+    folders = (root / "tests", root / "benchmarks" / "tests")
+    return [path.read_text("utf-8") for folder in folders for path in sorted(folder.rglob("*.py"))]
 
 
 def comments_and_code(source: str) -> tuple[int, int]:
@@ -161,7 +211,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.house", description=main.__doc__)
     parser.add_argument("root", nargs="?", type=Path, default=Path(__file__).parents[1], help="root of a checkout")
     parser.add_argument("--walk", action="store_true", help="what a stranger opens and reads from the README on")
+    parser.add_argument("--tests", action="store_true", help="what the tests pin that a user does not see")
     options = parser.parse_args(arguments)
+    if options.tests:
+        rows = [{"in the tests": name, "now": count, "at most": PINNED[name]}
+                for name, count in pinned(tests(options.root)).items()]  # fmt: skip
+        print(markdown_table(rows, list(rows[0])), end="")
+        return
     if options.walk:
         rows = walked(options.root)
         print(markdown_table(rows, list(rows[0])), end="")

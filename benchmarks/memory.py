@@ -56,15 +56,15 @@ def _in_this_process(spec: WorkloadSpec, engine: str, device: str, threads: int)
     torch.set_num_threads(threads)
     render_fn, workload = render_with(engine), spec.make().to(device)
     gradients(render_fn, _TINY.make().to(device))
-    before = _restart(workload.means.device)
+    before = restart_peak(workload.means.device)
     image(render_fn, workload)
-    forward = _peak(workload.means.device) - before
-    before = _restart(workload.means.device)
+    forward = peak_bytes(workload.means.device) - before
+    before = restart_peak(workload.means.device)
     gradients(render_fn, workload)
-    return {"forward": forward, "forward+backward": _peak(workload.means.device) - before}
+    return {"forward": forward, "forward+backward": peak_bytes(workload.means.device) - before}
 
 
-def _restart(device: torch.device) -> int:
+def restart_peak(device: torch.device) -> int:
     """Let the peak begin at the present memory; return that, bytes."""
     gc.collect()
     if device.type == "cuda":
@@ -75,7 +75,7 @@ def _restart(device: torch.device) -> int:
     return process_status("VmRSS")
 
 
-def _peak(device: torch.device) -> int:
+def peak_bytes(device: torch.device) -> int:
     """Return the peak since the last restart, bytes."""
     return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else process_status("VmHWM")
 

@@ -185,7 +185,7 @@ class ListMoments:
         return lists, background
 
 
-_CHUNK = 1 << 20
+CHUNK_ENTRIES = 1 << 20
 """Entries between two states that are kept for the backward pass, which computes again what is between them."""
 
 
@@ -288,12 +288,12 @@ class _Walk(NamedTuple):
         return torch.cat([self.alphas[:0], *reversed(parts)]), torch.cat([none, *places])
 
     def _chunks(self) -> list[tuple[list[int], Tensor, Tensor]]:
-        """Return counts, Gaussians and alphas of all entries, whole places and about `_CHUNK` entries at a time.
+        """Return counts, Gaussians and alphas of all entries, whole places and about `CHUNK_ENTRIES` entries at a time.
 
         Work per Gaussian and per pixel costs as much for one chunk as for all entries, so a chunk has several times as
         many entries as there are Gaussians or pixels.
         """
-        least = max(_CHUNK, 4 * len(self.ranks), 4 * len(self.values))
+        least = max(CHUNK_ENTRIES, 4 * len(self.ranks), 4 * len(self.values))
         counts: list[list[int]] = []
         room = 0
         for count in self.counts:

@@ -108,7 +108,7 @@ class GsplatModel:
         dx, dy = x - (pixels % view.width + 0.5), y - (pixels // view.width + 0.5)
         xx, xy, yy = conics[0, gaussians].unbind(-1)
         falloff = torch.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
-        alphas = (opacities[0, gaussians] * falloff).clamp(max=_largest_alpha(flat.device))
+        alphas = (opacities[0, gaussians] * falloff).clamp(max=largest_alpha(flat.device))
         return PixelLists(
             gaussians, pixels, alphas, self._colors(gsplat, view), view.height, view.width, self.background
         )
@@ -170,7 +170,7 @@ def _pairs(
 
 
 @functools.lru_cache
-def _largest_alpha(device: torch.device) -> float:
+def largest_alpha(device: torch.device) -> float:
     """Return this gsplat's clamp of alpha (0.999 up to 1.5, then 0.99), from a render of one opaque splat."""
     one, eye = torch.ones(1, 3, device=device), torch.eye(4, device=device)
     intrinsics = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]], device=device)

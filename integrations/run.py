@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Exceptions of the script, SystemExit included, pass through.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    options, audit = _parse(arguments), ScriptAudit()
+    options, audit = parse_options(arguments), ScriptAudit()
     try:
         _launch(options, arguments, audit)
     except SystemExit as ended:
@@ -119,7 +119,7 @@ def resume(arguments: Sequence[str], script: Sequence[str]) -> None:
     undo = ExitStack()
     undo.enter_context(old_aliases())
     atexit.register(undo.close)  # holds them until the end
-    hook: Hook = _parse([*arguments, *this], in_child=True).hook
+    hook: Hook = parse_options([*arguments, *this], in_child=True).hook
     hook.install()
     folder = folder_of_reports()
 
@@ -138,7 +138,7 @@ def _uninstall(hook: Hook) -> None:
         hook.uninstall()
 
 
-def _parse(arguments: Sequence[str] | None, *, in_child: bool = False) -> argparse.Namespace:
+def parse_options(arguments: Sequence[str] | None, *, in_child: bool = False) -> argparse.Namespace:
     """Parse and check the options before anything runs; adds the `hook` that they ask for."""
     parser = argparse.ArgumentParser(
         prog="python -m ca_reg.integrations.run",

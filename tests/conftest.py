@@ -99,7 +99,7 @@ class _WithoutTriton:
     @staticmethod
     def pytest_ignore_collect(collection_path):
         path = collection_path.relative_to(ROOT) if collection_path.is_relative_to(ROOT) else collection_path
-        return True if "triton" in path.as_posix() or path == Path("benchmarks/ahead.py") else None
+        return True if "triton" in path.as_posix() else None
 
 
 def pytest_configure(config):

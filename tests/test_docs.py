@@ -10,7 +10,7 @@ import shlex
 import pytest
 from pages import ROOT, blocks, fenced_blocks, linked_files
 
-from reference_trainer.cli import _parse
+from reference_trainer.cli import parse_command
 
 PAGES = {page.name: page for page in [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]}
 WITH_CODE = [name for name, page in PAGES.items() if blocks(page, "python") and name != "README.md"]  # see test_readme
@@ -54,7 +54,7 @@ def test_excerpts_import_what_exists(excerpt):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_are_understood(command):
-    assert callable(_parse(shlex.split(command)[1:]))
+    assert callable(parse_command(shlex.split(command)[1:]))
 
 
 @pytest.mark.parametrize("name", PAGES)

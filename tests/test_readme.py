@@ -106,7 +106,7 @@ def test_the_exact_score_of_gsplat(monkeypatch, capsys):
     """The variance over all masks of six Gaussians, each as likely as any, over gsplat's own torch functions."""
     pytest.importorskip("gsplat.cuda._torch_impl", exc_type=ImportError)
     monkeypatch.setattr(gsplat_model, "load_gsplat", lambda device: gsplat_stand_in.package())
-    gsplat_model._largest_alpha.cache_clear()
+    gsplat_model.largest_alpha.cache_clear()
     scene = gsplat_stand_in.centered(random_scene(6, 12, 10, seed=9, size=0.4))
     # In one place, so that half of them cover a pixel; none so opaque that a render would stop early.
     scene = scene._replace(means=0.2 * scene.means, opacities=0.6 + 0.1 * scene.opacities)
@@ -126,7 +126,7 @@ def test_the_exact_score_of_gsplat(monkeypatch, capsys):
         sh=sh, opacities=scene.opacities, viewmat=scene.camera.world_to_camera,
         K=gsplat_stand_in.intrinsics(scene.camera), width=12, height=10,
     )  # fmt: skip
-    gsplat_model._largest_alpha.cache_clear()
+    gsplat_model.largest_alpha.cache_clear()
     expected = torch.stack(images).var(0, unbiased=False).mean(0)[visible].mean().item()
     assert float(capsys.readouterr().out) == pytest.approx(expected, rel=1e-3)
 

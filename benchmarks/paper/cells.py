@@ -133,7 +133,7 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
             )
         if not load_scene(grid.scenes[name].options).test:
             raise ValueError(f"{name} has no test views, which the claims are about: hold some out with --split llff.")
-    cells = {_folder(grid, cell): cell for cell in left}
+    cells = {folder_of(grid, cell): cell for cell in left}
     failed: dict[str, Failure] = {}
 
     def keep(run: Run, results: dict[str, Any]) -> None:
@@ -214,7 +214,7 @@ def measured(cell: Cell, run: Path, results: Mapping[str, Any], dense: Path, dev
         split: {name: x for name in _FIGURES if (x := results["mean"].get(split, {}).get(name)) is not None}
         for split in ("test", "train")
     }
-    origin = {"commit": _commit(), "version": results["machine"]["ca_reg"], "cpu": results["machine"]["cpu"]}
+    origin = {"commit": commit(), "version": results["machine"]["ca_reg"], "cpu": results["machine"]["cpu"]}
     origin |= {"lpips": metric} if (metric := results.get("perceptual_metric")) else {}
     origin |= {} if device == "cpu" else {"device": results["machine"]["device"]}
     row: Row = {"setting": dict(cell.setting), "seed": cell.seed, **means, "gaussians": results["gaussians"],
@@ -274,7 +274,7 @@ def _row_of(cell: Cell, rows: Mapping[str, Rows]) -> Row | None:
     return rows[cell.scene].of(cell.setting).get(cell.seed)
 
 
-def _folder(grid: Grid, cell: Cell) -> Path:
+def folder_of(grid: Grid, cell: Cell) -> Path:
     """Return the folder of a training."""
     hidden = {"iterations": cell.setting["iterations"]}
     return grid.out / cell.scene / folder_name(label(cell.setting, hidden)) / f"seed_{cell.seed}"
@@ -284,7 +284,7 @@ def _run(grid: Grid, cell: Cell) -> Run:
     """Return a training as a run of `run_grid`."""
     config = config_of(cell.setting, cell.seed)
     options = grid.scenes[cell.scene].options_for(cell.setting, config.loss)
-    return Run(cell.name, options, config, _folder(grid, cell))
+    return Run(cell.name, options, config, folder_of(grid, cell))
 
 
 def _mean(of: Sequence[Mapping[str, float]]) -> dict[str, float]:
@@ -299,7 +299,7 @@ def _rounded(data: Any) -> Any:
     return (float(f"{data:.6g}") if math.isfinite(data) else None) if isinstance(data, float) else data
 
 
-def _commit() -> str | None:
+def commit() -> str | None:
     """Return the commit of this checkout, with "-dirty" if files differ from it; None outside a checkout."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():  # an unpacked archive may lie within another project's repository

@@ -175,7 +175,7 @@ def test_a_view_without_a_score_does_not_count(run):
     assert [result.reason is Reason.OK for result in results] == [False, True]
     assert torch.equal(both, alone)
     for views in ([away], []):
-        with pytest.raises(ValueError, match=f"none of the {len(views)} views has a score"):
+        with pytest.raises(ValueError, match=f"the {len(views)} views"):
             mean_shares(model, views)
 
 
@@ -199,9 +199,9 @@ def test_other_views_and_mistakes(run, tmp_path):
     data = study_attribution(run, tmp_path, split="train", drop_rate=0.25)
     assert sorted(data["views"]) == sorted(view.name for view in load_run_model(run)[1].train)
     assert data["drop_rate"] == 0.25
-    with pytest.raises(ValueError, match="split must be 'train' or 'test', got 'val'"):
+    with pytest.raises(ValueError, match=r"split .*'test', got 'val'"):
         study_attribution(run, split="val")
-    with pytest.raises(ValueError, match=r"at drop rate 0\.0 is 0: there is nothing to attribute"):
+    with pytest.raises(ValueError, match=r"drop rate 0\.0 is 0"):
         study_attribution(run, drop_rate=0.0)
     with pytest.raises(FileNotFoundError, match="holds no run"):
         study_attribution(tmp_path / "nowhere")

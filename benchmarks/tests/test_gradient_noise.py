@@ -305,7 +305,7 @@ def test_masks_that_leave_nothing_have_a_gradient_of_zero(scene):
     [
         ({}, 2, "power of two of at least 4, got 2"),
         ({}, 12, "power of two of at least 4, got 12"),
-        ({"dropout": 0.0}, 4, "dropout must lie between 0 and 1, got 0"),
+        ({"dropout": 0.0}, 4, "dropout .*between 0 and 1, got 0"),
         ({"noise": 0.1}, 4, "plain dropout"),
         ({"regularizer": "noise(0.1)"}, 4, "plain dropout"),
     ],
@@ -339,8 +339,9 @@ def run(trainer, tmp_path_factory):
 @pytest.mark.slow
 def test_a_study_measures_plain_dropout_at_the_training_views_of_a_run(trainer, run, monkeypatch):
     monkeypatch.setattr(study_module, "ROUNDS", 1)
-    ((name, settings),) = gradient_noise_study([run], draws=4, dropout=0.2).cases.items()
-    result = GradientNoise.from_dict(json.loads(json.dumps(study_module._measure(**settings))))
+    study = gradient_noise_study([run], draws=4, dropout=0.2)
+    ((name, settings),) = study.cases.items()
+    result = GradientNoise.from_dict(json.loads(json.dumps(study.measure(**settings))))
     plain = TrainConfig(dropout=0.2, seed=5)
     step = trainer.gaussians, trainer.background, plain, trainer.views[:1]
     alone = gradient_noise(*step, sh_degree=0, draws=4)

@@ -33,7 +33,7 @@ def test_one_thing_grows_along_every_axis(axes):
 def test_no_workload_is_larger_than_asked_for():
     sizes = {spec.gaussians for axis in growth_axes(2_000).values() for spec in axis.points.values()}
     assert max(sizes) == 2_000
-    with pytest.raises(ValueError, match="at least 1000 Gaussians, got 999"):
+    with pytest.raises(ValueError, match="1000 Gaussians, got 999"):
         growth_axes(999)
 
 
@@ -52,5 +52,5 @@ def test_the_standard_scales_are_found_again():
 
 @pytest.mark.parametrize("per_pixel", [0.01, 200.0])
 def test_impossible_numbers_are_refused(per_pixel):
-    with pytest.raises(ValueError, match=f"100 Gaussians on 32x32 pixels cannot be {per_pixel:g} at the mean pixel"):
+    with pytest.raises(ValueError, match=f"100 Gaussians on 32x32 pixels .*{per_pixel:g}"):
         calibrated(100, 32, 32, per_pixel)

@@ -45,6 +45,42 @@ def test_what_is_written_for_linters_is_no_comment(line, comments):
     assert house.comments_and_code(f"{line}\n") == (comments, 1)
 
 
+PINNING = """
+from a import b, _c
+from a._d import e
+import pytest
+
+
+class Fake:
+    def f(self):
+        return self._own
+
+
+def test(monkeypatch, case):
+    monkeypatch.setattr(b, "_f", 1)
+    monkeypatch.setattr("a.b.c", case._replace(x=b._f))
+    with pytest.raises(ValueError, match=r"one two three, --no-more and 'four' in x\\.py"):
+        e()
+    assert "one two three four five" in f"one {b} two three four"
+"""
+
+
+def test_what_tests_pin_is_counted():
+    counts = house.pinned([PINNING])
+    assert counts == {"matches of 4 words": 1, "matches of 6 words": 0, "asserts on 5 words": 1,
+                      "reads of private names": 1, "imports of private names": 2,
+                      "patches of private names": 1}  # fmt: skip
+
+
+def test_the_tests_pin_no_more_than_they_did(capsys):
+    """Where a count has fallen, its limit in `house.PINNED` falls with it."""
+    house.main(["--tests"])
+    table = capsys.readouterr().out
+    counts = house.pinned(house.tests(Path(__file__).parents[2]))
+    assert all(f"| {name} | {counts[name]} | {most} |" in table for name, most in house.PINNED.items())
+    assert {name: max(count, house.PINNED[name]) for name, count in counts.items()} == house.PINNED
+
+
 def test_no_way_from_the_readme_is_lost():
     rows = house.walked(Path(__file__).parents[2])
     assert len(rows) == len(house.WALKS)

@@ -64,7 +64,10 @@ def test_ranks_and_what_parts_of_the_pixels_hold():
 def test_a_run_is_measured_and_told(tiny_scene, tmp_path, monkeypatch):
     trainer = Trainer(tiny_scene, TrainConfig(initial_opacity=0.7, dropout=0.2))
     monkeypatch.setattr(oracle, "load_run", lambda run: trainer)
-    found = oracle._measure(tmp_path / "checkpoint.pt", steps=3)
+    (tmp_path / "checkpoint.pt").touch()
+    study = oracle.oracle_study([tmp_path], steps=3)
+    ((_, case),) = study.cases.items()
+    found = study.measure(**case)
     pixels, gains = found["pixels"], found["gains"]
     for name in ("exact CA", "edges"):
         assert all(a <= b for a, b in zip(pixels[f"held, {name}"], pixels["held, error"], strict=True))
@@ -72,4 +75,4 @@ def test_a_run_is_measured_and_told(tiny_scene, tmp_path, monkeypatch):
     assert set(gains) == set(oracle.CRITERIA)
     assert gains["error, these views"]["halved"][0] > max(0, gains["random"]["halved"][0])
     assert found["rates, these views"] > 0
-    assert oracle._report({"one": found}).count("| one |") == 3 + 2 * len(gains) + 1
+    assert study.report({"one": found}).count("| one |") == 3 + 2 * len(gains) + 1

@@ -8,7 +8,7 @@ import shlex
 import pytest
 from pages import ROOT, fenced_blocks, linked_files
 
-from reference_trainer.cli import _parse
+from reference_trainer.cli import parse_command
 
 PAGES = sorted((ROOT / "benchmarks").glob("*.md"))
 
@@ -50,7 +50,7 @@ COMMANDS = {
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_commands_are_understood(command):
-    assert callable(_parse(shlex.split(command)[1:]))
+    assert callable(parse_command(shlex.split(command)[1:]))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

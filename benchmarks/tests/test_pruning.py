@@ -136,7 +136,7 @@ def test_what_was_pruned_is_measured_before_and_after_further_steps(runs, tmp_pa
     assert {name: case for name, case in study.cases.items() if case["steps"] == 0}.items() <= more.items()
 
 
-def test_the_report_is_of_mean_and_spread_over_runs():
+def test_the_report_is_of_mean_and_spread_over_runs(runs):
     def record(run: float, criterion: str, fraction: float, steps: int) -> dict:
         what = {"criterion": criterion, "fraction": fraction, "steps": steps, "gaussians": 90}
         scores = {"psnr": 20 + run - fraction, "ca_exact": math.nan, "covered": 0.5}
@@ -144,15 +144,16 @@ def test_the_report_is_of_mean_and_spread_over_runs():
 
     plan = [("nothing removed", 0.0), *((name, part) for part in (0.1, 0.4) for name in CRITERIA)]
     found = {str((run, *each, n)): record(run, *each, n) for run in (0.0, 0.4, 0.8) for each in plan for n in (0, 7)}
-    text = pruning_module._report(found)
-    assert text.startswith("# Pruning at equal count, 3 runs\n")
+    study = pruning_study([*runs[0]])
+    text = study.report(found)
+    assert "3 runs" in text.splitlines()[0]
     as_pruned, refined = text.split("## After 7 further steps")
     for part, protocol in ((as_pruned, "2.40 ± 0.40"), (refined, "9.40 ± 0.40")):
         rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in part.splitlines() if "%" in line]
         assert len(rows) == 1 + len(plan)  # with the header
         assert rows[-1] == ["random", "40%", "90", "20.00 ± 0.40", "n/a", "50 ± 0", protocol]
     figure = Figure()
-    pruning_module._plot(found, figure)
+    study.plot(found, figure)
     lines = figure.axes[0].get_legend_handles_labels()[0]
     assert (len(figure.axes), len(lines)) == (4, len(CRITERIA))
     x, y = lines[0].lines[0].get_data()
@@ -165,11 +166,11 @@ def test_mistakes(runs, tmp_path):
     for fractions in ([], [0.0], [0.2, 1.0]):
         with pytest.raises(ValueError, match=r"each in \(0, 1\), got"):
             pruning_study([run], fractions=fractions)
-    with pytest.raises(ValueError, match="refine must not be negative, got -1"):
+    with pytest.raises(ValueError, match=r"refine .*negative, got -1"):
         pruning_study([run], refine=-1)
     with pytest.raises(FileNotFoundError, match="holds no run"):
         pruning_study([tmp_path])
-    with pytest.raises(ValueError, match=r"fraction to remove must be in \[0, 1\), got 1"):
+    with pytest.raises(ValueError, match=r"fraction .*\[0, 1\), got 1"):
         prune_lowest(None, torch.zeros(3), 1.0)
 
 
@@ -181,5 +182,5 @@ def test_runs_of_two_kinds_have_no_mean(runs, tmp_path):
     config = json.loads((run / CONFIG).read_text())
     config["config"]["dropout"] = 0.5
     write_json(other / CONFIG, config)
-    with pytest.raises(ValueError, match="differ in dropout; runs whose mean is taken may differ in their seed only"):
+    with pytest.raises(ValueError, match=r"differ in dropout; .*seed"):
         pruning_study([run, other])

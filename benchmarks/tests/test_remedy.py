@@ -26,9 +26,9 @@ def test_held_out_views_of_the_built_in_scene_are_none_of_its_test_views(monkeyp
 
 def test_settings_are_chosen_on_the_choosing_scenes_alone():
     arms = ["dropout=0.2", "dropout=0.3"]
-    with pytest.raises(ValueError, match="choose knows the scenes synthetic, fern, lego"):
+    with pytest.raises(ValueError, match=r"choose .*synthetic, fern, lego"):
         remedy.remedy_study("choose", arms, scenes=["fern", "fountain"], seeds=1)
-    with pytest.raises(ValueError, match="a reference and at least one more arm"):
+    with pytest.raises(ValueError, match="one more arm"):
         remedy.remedy_study("choose", arms[:1], scenes=["fern"], seeds=1)
     cases = remedy.remedy_study("final", arms, scenes=["fern", "fountain"], seeds=2, data="data").cases
     assert len(cases) == 8
@@ -43,7 +43,8 @@ def test_differences_are_paired_by_seed():
                           "processor_seconds": 10.0 if arm == "a" else 15.0}
         for arm, seed, psnr in rows
     }  # fmt: skip
-    line = next(line for line in remedy._report(records).splitlines() if line.startswith("| `b`"))
+    study = remedy.remedy_study("choose", ["dropout=0.2", "dropout=0.3"], scenes=["fern"], seeds=1)
+    line = next(line for line in study.report(records).splitlines() if line.startswith("| `b`"))
     assert "| +1.000, +2.000 | +1.500 ± 0.500 | 1.50 |" in line
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 from benchmarks import setting
@@ -37,12 +38,12 @@ def test_a_pair_is_of_one_scene_and_seed(tmp_path):
     own = [row("fern", "drawn", 0, 22.5), row("fern", "drawn", 1, 20.7), row("fern", "expectation", 0, 10.0)]
     text = setting.judging(own, tmp_path)
     assert "+2.50, -0.30" in text
-    assert "mean gain over plain: +1.10 dB over 2 pairs of 1 scenes" in text
+    assert "+1.10 dB over 2 pairs of 1 scenes" in text
     assert "worst pair: -0.30 dB" in text
-    assert "Gaussians against dropout alone, mean over scenes: 0.50" in text
+    assert "mean over scenes: 0.50" in text
     later = row("fern", "from 1,000", 0, 23.0) | {"seconds": 45.0, "gaussians": 80}
     text = setting.judging([*own, later], tmp_path, chosen="from 1,000")
-    assert "against drawn, same seeds, mean over scenes: PSNR +0.50 dB" in text
+    assert "mean over scenes: PSNR +0.50 dB" in text
     assert "processor time 0.75, Gaussians 0.80" in text
 
 
@@ -53,8 +54,8 @@ def test_binocular_is_met_by_seeds_that_all_have(tmp_path):
     rows += [row("sceaux", "drawn", 2, 20.0), row("sceaux", "from 1,000", 2, 21.0), row("sceaux", other, 2, 20.5)]
     text = setting.binocular(rows, tmp_path)
     assert "cape" not in text
-    assert "drawn: ahead on 1 of 2 scenes, by +0.25 dB in the mean" in text
-    assert "from 1,000: ahead on 2 of 2 scenes, by +0.75 dB in the mean" in text
+    assert re.search(r"drawn: .*1 of 2 scenes, .*\+0\.25 dB", text)
+    assert re.search(r"from 1,000: .*2 of 2 scenes, .*\+0\.75 dB", text)
 
 
 def test_other_points_stand_apart():

@@ -69,11 +69,11 @@ def test_only_what_both_have_is_compared(old):
     new = copy.deepcopy(old)
     new["ratios"] = {"large: forward / baseline": 9.0}
     assert regressions(new, old) == []
-    with pytest.raises(ValueError, match="no number in common"):
+    with pytest.raises(ValueError, match="in common"):
         regressions({**new, "errors": {}}, old)
 
 
 @pytest.mark.parametrize("change", [{"device": "cuda"}, {"machine": {"threads": 1}}])
 def test_other_devices_and_threads_are_not_compared(old, change):
-    with pytest.raises(ValueError, match=r"same number of threads, got .* and cpu with 2"):
+    with pytest.raises(ValueError, match=r"number of threads, .*cpu with 2"):
         regressions({**old, **change}, old)

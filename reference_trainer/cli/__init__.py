@@ -32,7 +32,7 @@ from reference_trainer.devices import check_device
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES, with_recipe
 
-__all__ = ["log_shown", "main"]
+__all__ = ["log_shown", "main", "parse_command"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(arguments: Sequence[str]) -> None:
     try:
-        command = _parse(arguments)
+        command = parse_command(arguments)
         computing = command.what if isinstance(command, Study) else command
         if hasattr(computing, "check"):  # refuses what cannot work, before anything heavy is imported
             computing.check()
@@ -93,7 +93,7 @@ def log_shown() -> Iterator[None]:
         trainer.setLevel(level)
 
 
-def _parse(arguments: Sequence[str]) -> Any:
+def parse_command(arguments: Sequence[str]) -> Any:
     """Return the command with its options; exits if they cannot be parsed."""
     if arguments[:1] == ["study"] and (moved := MOVED.get("".join(arguments[1:2]))):
         raise ValueError(f"study {arguments[1]} is now {moved}, called from a checkout of the repository.")

@@ -17,7 +17,7 @@ from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["Run", "Running", "run_grid", "train_run"]
+__all__ = ["Run", "Running", "outcome_line", "run_grid", "train_run"]
 
 _log = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ def run_grid(
 
     def note(number: int, outcome: Value | Failure, when: str) -> None:
         outcomes[number] = outcome.value if isinstance(outcome, Value) else outcome
-        line = _line(outcomes[number], when)
+        line = outcome_line(outcomes[number], when)
         _log.info("[%d/%d] %s: %s", len(outcomes), len(runs), runs[number].label, line)
         if isinstance(outcome, Value):
             done(runs[number], outcome.value)
@@ -122,7 +122,7 @@ def _where(run: Run) -> tuple[SceneOptions, TrainConfig, Path]:
     return run.options.absolute(), run.config, run.out.resolve()
 
 
-def _line(outcome: dict[str, Any] | Failure, when: str) -> str:
+def outcome_line(outcome: dict[str, Any] | Failure, when: str) -> str:
     """Summarize an outcome in one line."""
     if isinstance(outcome, Failure):
         return f"FAILED, {outcome.error}"

@@ -17,7 +17,7 @@ from reference_trainer.scenes.images import is_image
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud
 
-__all__ = ["Capture", "Reader", "SceneFormat", "find_reader", "only_default", "register_format"]
+__all__ = ["FORMATS", "Capture", "Reader", "SceneFormat", "find_reader", "only_default", "register_format"]
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class SceneFormat:
     read: Reader
 
 
-_FORMATS: dict[str, SceneFormat] = {}
+FORMATS: dict[str, SceneFormat] = {}
+"""By name, in the order in which a folder is tried."""
 
 
 def register_format(format: SceneFormat) -> None:
@@ -78,9 +79,9 @@ def register_format(format: SceneFormat) -> None:
         ...     _ = Path(folder, "toy.txt").write_text("a camera")
         ...     find_reader(Path(folder), "auto") is toy.read
         True
-        >>> del _FORMATS["toy"]
+        >>> del FORMATS["toy"]
     """
-    _FORMATS[format.name] = format
+    FORMATS[format.name] = format
 
 
 def find_reader(root: Path, name: str) -> Reader:
@@ -102,18 +103,18 @@ def find_reader(root: Path, name: str) -> Reader:
             raise ValueError(f"format {name!r} must name a function (root, options) -> Capture: {error}.") from error
         return reader
     if name == "auto":
-        name = next((format.name for format in _FORMATS.values() if format.found(root)), name)
-    if name in _FORMATS:
-        return _FORMATS[name].read
+        name = next((format.name for format in FORMATS.values() if format.found(root)), name)
+    if name in FORMATS:
+        return FORMATS[name].read
     if name != "auto":
-        raise ValueError(f"format must be auto, module:function or one of {', '.join(_FORMATS)}, got {name!r}.")
+        raise ValueError(f"format must be auto, module:function or one of {', '.join(FORMATS)}, got {name!r}.")
     if any(map(is_image, (*root.glob("*"), *root.glob("images/*")))):
         raise ValueError(
             f"the photographs in {root} have no cameras yet: `ca-reg poses {shlex.quote(str(root))}` finds them (pip "
             "install 'ca_reg[colmap]'), as do COLMAP, VGGT and InstantSplat."
         )
     raise ValueError(
-        f"{root} has none of {', '.join(format.sign for format in _FORMATS.values())}; it has "
+        f"{root} has none of {', '.join(format.sign for format in FORMATS.values())}; it has "
         f"{sorted(entry.name for entry in root.iterdir())[:20]}."
     )
 

@@ -29,7 +29,7 @@ from reference_trainer.scenes.images import (
     unreadable_photographs,
 )
 
-__all__ = ["FEW", "FoundPoses", "enlarge", "feature_size", "find_poses", "left_out"]
+__all__ = ["FEW", "FoundPoses", "adjust", "enlarge", "feature_size", "find_poses", "left_out", "reconstruct"]
 
 FEW = 8
 """Below this many photographs COLMAP's settings, made for dozens, are replaced."""
@@ -133,7 +133,7 @@ def find_poses(
         if copy.exists() and not filecmp.cmp(photo, copy):
             raise FileExistsError(f"{images} holds another {photo.name}, which is not overwritten: give another --out.")
     with tempfile.TemporaryDirectory() as work:
-        model = _reconstruct(photos, unread, Path(work), camera, seed, progress)
+        model = reconstruct(photos, unread, Path(work), camera, seed, progress)
         if model is None:
             raise ValueError(
                 f"none of the {len(photos)} photographs in {folder} could be placed: neighboring ones must show "
@@ -184,7 +184,7 @@ def _check_number(photos: list[Path], unread: Mapping[str, str], folder: Path) -
         raise ValueError(f"{folder} holds {held}, and depth needs at least 2: take another one.{others}")
 
 
-def _reconstruct(
+def reconstruct(
     photos: list[Path], unread: dict[str, str], work: Path, camera: str | None, seed: int, progress: bool
 ) -> Any:
     """Return the reconstruction that registers the most photographs, None if there is none.
@@ -246,7 +246,7 @@ def _reconstruct(
     if not models:
         return None
     model = max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    _adjust(model, mapping.ba_refine_focal_length)
+    adjust(model, mapping.ba_refine_focal_length)
     _reduce(model, sizes)
     return model
 
@@ -281,7 +281,7 @@ def enlarge(photos: list[Path], database: Path, folder: Path) -> dict[int, tuple
     return sizes
 
 
-def _adjust(model: Any, refine_focal_length: bool) -> None:
+def adjust(model: Any, refine_focal_length: bool) -> None:
     """Adjust cameras and points once more, with a robust loss: COLMAP's own squares the errors of all features."""
     import pycolmap
 

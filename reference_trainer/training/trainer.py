@@ -171,7 +171,7 @@ class Trainer:
             for model in self.models:
                 model.density.before_step(model.optimizer, self.step)
             self.density.together(self.models, self.step)
-            steps = self._begin_steps()
+            steps = self.begin_steps()
             for step in steps:
                 if self.config.analytic and len(step.regularizer):
                     step.expect()
@@ -299,7 +299,7 @@ class Trainer:
                 if model is self.models[0]:
                     self.removed = rendered, found
 
-    def _begin_steps(self) -> list[Step]:
+    def begin_steps(self) -> list[Step]:
         """Choose the view of the step and what regularizes it; return a `Step` for every model."""
         begun, steps, background = self.step >= self.config.regularize_from, list[Step](), self.background
         if self.config.random_background:

@@ -101,9 +101,7 @@ class ViewerModel:
         Raises ValueError if heat is needed (for its colors or to hide Gaussians) and cannot be measured, see `heat`; or
         support without photographs.
         """
-        if options != self._chosen_last[0]:
-            self._chosen_last = options, self._chosen(options)
-        model, view = self._chosen_last[1], Viewpoint("", camera.to(self.model.gaussians.means.device))
+        model, view = self.chosen(options), Viewpoint("", camera.to(self.model.gaussians.means.device))
         renders = {
             "co-adaptation": self._co_adaptation,
             "expected error": self._expected_error,
@@ -164,8 +162,11 @@ class ViewerModel:
         scale = f"{1 / low:.3g}", f"{1 / high:.3g}", "depth; gray: nothing covers half of the pixel"
         return Display(colors.T.view_as(out.image), "", scale)
 
-    def _chosen(self, options: DisplayOptions) -> TrainedModel:
-        """Return the model with the Gaussians, colors and opacities of some options."""
+    @torch.no_grad()
+    def chosen(self, options: DisplayOptions) -> TrainedModel:
+        """Return the model with the Gaussians, colors and opacities of some options; the last one is kept."""
+        if options == self._chosen_last[0]:
+            return self._chosen_last[1]
         gaussians, regularizer = self.model.gaussians, self.model.regularizer
         if options.mode != "co-adaptation" and (options.mask or options.noise):  # in place of the test-time opacities
             drawn = _draws(options).regularize(
@@ -177,7 +178,8 @@ class ViewerModel:
             gaussians = colored_by(gaussians, self.heat.values, low, high)
         if options.hidden:
             gaussians = gaussians[self.heat.ranks < 1 - options.hidden]
-        return replace(self.model, gaussians=gaussians, regularizer=regularizer)
+        self._chosen_last = options, replace(self.model, gaussians=gaussians, regularizer=regularizer)
+        return self._chosen_last[1]
 
 
 def _draws(options: DisplayOptions) -> Chain:

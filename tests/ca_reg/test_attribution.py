@@ -233,7 +233,7 @@ def test_a_sampled_score_cannot_be_attributed(make):
         ("attribute", lambda: attribute(score, scene.moments.shares, scene.opacity, None)),
         ("total_effects", lambda: total_effects(score, scene.opacity, None)),
     ):
-        with pytest.raises(ValueError, match=rf"{name} needs an exact score, got the method '(sampling|adaptive)'"):
+        with pytest.raises(ValueError, match=f"{name} .*exact score, .*'(sampling|adaptive)'"):
             call()
 
 
@@ -251,7 +251,7 @@ def test_total_effects_need_a_gradient():
         return out._replace(variance=out.variance * torch.ones(1, dtype=torch.float64, requires_grad=True))
 
     for moments_fn in (constant, detached, elsewhere):
-        with pytest.raises(ValueError, match=r"without a gradient in multiplier\.variance"):
+        with pytest.raises(ValueError, match=r"gradient in multiplier\.variance"):
             total_effects(CAScore.exact(moments_fn, threshold=THRESHOLD), scene.opacity, None)
 
 
@@ -263,7 +263,7 @@ def test_bad_input():
             call(scene.opacity + 1)
         with pytest.raises(TypeError, match="floating-point"):
             call(torch.ones(3, dtype=torch.int64))
-    with pytest.raises(ValueError, match=r"one share per Gaussian, shape \(3,\), got \(2,\)"):
+    with pytest.raises(ValueError, match=r"share.* shape \(3,\), got \(2,\)"):
         attribute(score, lambda *args: scene.moments.shares(*args)[:2], scene.opacity, None)
 
 
@@ -286,7 +286,7 @@ def test_what_hangs_is_seen_there_more_than_here_and_holds_much_of_the_score():
     ("change", "message"),
     [
         ({"there": torch.ones(2)}, r"shape \(N,\), got \(3,\), \(2,\) and \(3,\)"),
-        ({"ratio": -1.0}, "ratio must be at least 0"),
+        ({"ratio": -1.0}, "ratio .*at least 0"),
         ({"together": 1.0}, r"together and alone in \[0, 1\)"),
         ({"alone": -0.1}, r"together and alone in \[0, 1\)"),
     ],

@@ -127,7 +127,7 @@ def test_members_may_change_other_parameters_and_say_what_they_need():
     assert chain.needs == ("scales",)
     x = chain(Params(torch.full((6,), 0.5), scales=torch.ones(6, 3)))
     assert bool((x.scales > 1).all())
-    with pytest.raises(ValueError, match=r"ScaleUp needs scales .*Params\(opacities, scales"):
+    with pytest.raises(ValueError, match=r"ScaleUp needs scales .*Params\("):
         chain(torch.full((6,), 0.5))
 
 
@@ -160,7 +160,7 @@ def test_foreign_modules_are_members():
     torch.testing.assert_close(chain.expected(Params(opacity, step=50)).opacities, opacity * 0.5)
     assert module.training, "the module itself is not touched"
     assert module.inner.step == 30
-    with pytest.raises(TypeError, match="must be a torch module"):
+    with pytest.raises(TypeError, match="torch module"):
         Chain(torch.relu)
 
 
@@ -217,7 +217,7 @@ def test_the_text_of_a_regularizer_has_its_arguments():
 
     assert repr(Fade(0.1)) == "Fade(speed=0.1, share=0.5)"
     for kind, name in ((Fade, "speed"), (IndependentDropout, "the rate")):
-        with pytest.raises(ValueError, match=rf"^{name} must be in \[0, 1\), got 1.5"):
+        with pytest.raises(ValueError, match=rf"^{name} must .*\[0, 1\), got 1\.5"):
             kind(1.5)
-        with pytest.raises(ValueError, match=rf"^{name} at step 9 must be in \[0, 1\), got 1.5"):
+        with pytest.raises(ValueError, match=rf"^{name} at step 9 .*\[0, 1\), got 1\.5"):
             kind(lambda step: 1.5).set_step(9)

@@ -147,15 +147,15 @@ def test_a_small_picture_is_smoothed_as_well():
 
 
 def test_errors_say_what_is_missing():
-    with pytest.raises(ValueError, match="contrast and empty, got deviation"):
+    with pytest.raises(ValueError, match="empty, got deviation"):
         expected_error(flat(deviation=0.1))
     with pytest.raises(ValueError, match="share one shape"):
         expected_error({"empty": torch.zeros(3, 4), "contrast": torch.zeros(4, 4)})
-    with pytest.raises(TypeError, match="empty must be a torch tensor"):
+    with pytest.raises(TypeError, match=r"empty .*torch tensor"):
         expected_error({"empty": 0.5, "contrast": torch.zeros(4, 4)})
     with pytest.raises(ValueError, match="alpha"):
         error_map(lambda opacity, view: torch.zeros(3, 4, 4), torch.ones(2), None)
-    with pytest.raises(ValueError, match=r"p must be in \[0, 1\)"):
+    with pytest.raises(ValueError, match=r"\bp .*\[0, 1\)"):
         error_map(wall, torch.ones(2), None, p=1.0)
-    with pytest.raises(ValueError, match=r"opacity must be activated.*torch.sigmoid"):
+    with pytest.raises(ValueError, match=r"opacity .*torch\.sigmoid"):
         error_map(wall, torch.tensor([-2.0, 3.0]), None)

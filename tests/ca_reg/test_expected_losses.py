@@ -190,13 +190,13 @@ def test_float32_agrees_with_float64():
 @pytest.mark.parametrize("loss", [expected_squared_error, expected_absolute_error])
 def test_wrong_tensors_are_refused(loss):
     image = torch.rand(3, 4, 5)
-    with pytest.raises(ValueError, match="target must have the shape of mean"):
+    with pytest.raises(ValueError, match=r"target .*shape of mean"):
         loss(image, image, image[0])
-    with pytest.raises(ValueError, match="variance must have the shape of mean"):
+    with pytest.raises(ValueError, match=r"variance .*shape of mean"):
         loss(image, image.mean(0), image)
-    with pytest.raises(TypeError, match="target must be a floating-point tensor"):
+    with pytest.raises(TypeError, match=r"target .*floating-point"):
         loss(image, image, torch.zeros(3, 4, 5, dtype=torch.uint8))
-    with pytest.raises(TypeError, match="variance must be a torch tensor"):
+    with pytest.raises(TypeError, match=r"variance .*torch tensor"):
         loss(image, 0.1, image)
 
 

@@ -119,7 +119,7 @@ def test_chunks_of_any_size_give_the_same(monkeypatch):
     scene, per_gaussian, weights = dense(), MULTIPLIERS["(N,)"], uniform(3, HEIGHT, WIDTH)
     moments, found = ListMoments(scene.lists), []
     for least in (1, 1000):
-        monkeypatch.setattr("ca_reg.lists._CHUNK", least)
+        monkeypatch.setattr("ca_reg.lists.CHUNK_ENTRIES", least)
         shares = moments.shares(scene.opacity, None, per_gaussian, None, weights)
         found.append((*moments(scene.opacity, None, per_gaussian, None), shares))
     for a, b in zip(*found, strict=True):
@@ -243,7 +243,7 @@ def test_lists_by_brute_force_agree_with_the_renderer():
 
 
 def test_gradients(monkeypatch):
-    monkeypatch.setattr("ca_reg.lists._CHUNK", 1)
+    monkeypatch.setattr("ca_reg.lists.CHUNK_ENTRIES", 1)
     scene = dense(seed=1)
 
     def f(opacity, colors, background, mean, variance):
@@ -263,19 +263,19 @@ def test_the_callable_itself_is_checked():
 @pytest.mark.parametrize(
     ("change", "error", "match"),
     [
-        ({"gaussians": torch.tensor([0.0, 1.0])}, TypeError, "gaussians of the lists must be int64 or int32"),
-        ({"gaussians": torch.tensor([0, 2])}, ValueError, r"gaussians of the lists must be in \[0, 2\), got .* 0 to 2"),
+        ({"gaussians": torch.tensor([0.0, 1.0])}, TypeError, "gaussians .*int64 or int32"),
+        ({"gaussians": torch.tensor([0, 2])}, ValueError, r"gaussians .*\[0, 2\), got .* 0 to 2"),
         ({"gaussians": torch.tensor([-1, 1])}, ValueError, r"in \[0, 2\), got values from -1 to 1"),
-        ({"pixels": torch.tensor([0, 6])}, ValueError, r"pixels of the lists must be in \[0, 6\)"),
-        ({"pixels": torch.tensor([0])}, ValueError, r"pixels of the lists must have the shape of alphas, \(2,\)"),
+        ({"pixels": torch.tensor([0, 6])}, ValueError, r"pixels .*\[0, 6\)"),
+        ({"pixels": torch.tensor([0])}, ValueError, r"pixels .*shape of alphas, \(2,\)"),
         ({"alphas": torch.tensor([0.5, 1.5])}, ValueError, r"alphas must be in \[0, 1\]"),
-        ({"alphas": torch.ones(2, 1)}, ValueError, r"alphas of the lists must have shape \(P,\)"),
+        ({"alphas": torch.ones(2, 1)}, ValueError, r"alphas .*shape \(P,\)"),
         ({"alphas": torch.ones(2).double()}, TypeError, "same dtype"),
-        ({"colors": torch.ones(3, 3)}, ValueError, r"colors of the lists must have shape \(2, 3\)"),
-        ({"height": 0}, ValueError, "height must be at least 1"),
+        ({"colors": torch.ones(3, 3)}, ValueError, r"colors .*shape \(2, 3\)"),
+        ({"height": 0}, ValueError, "height .*at least 1"),
         ({"background": torch.tensor([0.0, torch.nan, 0.0])}, ValueError, "background must be finite"),
         ({"colors": torch.tensor([[0.5] * 3, [torch.inf] * 3])}, ValueError, "colors must be finite"),
-        ({"background": torch.ones(4)}, ValueError, r"background must have shape \(3,\) or \(3, 2, 3\)"),
+        ({"background": torch.ones(4)}, ValueError, r"background .*shape \(3,\) or \(3, 2, 3\)"),
     ],
 )
 def test_lists_are_checked(change, error, match):
@@ -289,13 +289,13 @@ def test_lists_are_checked(change, error, match):
 def test_arguments_are_checked():
     scene = padded()
     moments = ListMoments(scene.lists)
-    with pytest.raises(ValueError, match="opacity must have shape"):
+    with pytest.raises(ValueError, match=r"opacity .*shape"):
         moments(scene.opacity[None, :], None, DROPOUT, None)
     with pytest.raises(ValueError, match="channels first"):
         moments(scene.opacity, None, DROPOUT, torch.zeros(HEIGHT, WIDTH, 3))
-    with pytest.raises(ValueError, match="variance of the multiplier must be a number or have shape"):
+    with pytest.raises(ValueError, match=r"variance .*multiplier .*shape"):
         moments(scene.opacity, None, Multiplier(1.0, torch.ones(N + 1)), None)
-    with pytest.raises(ValueError, match=r"weights must have the shape of the image, \(3, 5\)"):
+    with pytest.raises(ValueError, match=r"weights .*\(3, 5\)"):
         moments.shares(scene.opacity, None, DROPOUT, None, torch.ones(WIDTH, HEIGHT))
-    with pytest.raises(TypeError, match=r"must return ca_reg\.lists\.PixelLists, got tuple"):
+    with pytest.raises(TypeError, match=r"ca_reg\.lists\.PixelLists, got tuple"):
         ListMoments(lambda o, v: tuple(scene.lists(o, v)))(scene.opacity, None, DROPOUT, None)

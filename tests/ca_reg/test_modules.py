@@ -94,7 +94,7 @@ def test_logits_are_recognized_at_the_first_call():
     for module in (GaussianDropout(0.2), OpacityNoise(0.2), GaussianDropout(0.2).eval()):
         with pytest.raises(ValueError, match="sigmoid"):
             module(torch.randn(50))
-        with pytest.raises(ValueError, match="got values from nan to nan; the training has diverged"):
+        with pytest.raises(ValueError, match=r"from nan to nan; .*diverged"):
             module(OPACITY.clone().index_fill_(0, torch.tensor(7), torch.nan))
 
 
@@ -131,9 +131,9 @@ def test_rates_are_checked_at_construction(make):
 def test_a_rate_that_is_no_number_is_refused(rate):
     """One per Gaussian is for the functions; in a module a subclass of IndependentDropout defines them."""
     for kind, name in ((GaussianDropout, "p"), (OpacityNoise, "sigma")):
-        with pytest.raises(TypeError, match=rf"^{name} must be a real number, got {type(rate).__name__}"):
+        with pytest.raises(TypeError, match=f"^{name} must .*number, got {type(rate).__name__}"):
             kind(rate)
-        with pytest.raises(TypeError, match=rf"^{name} at step 3 must be a real number, got {type(rate).__name__}"):
+        with pytest.raises(TypeError, match=f"^{name} at step 3 .*got {type(rate).__name__}"):
             kind(lambda step: rate).set_step(3)
 
 
@@ -166,7 +166,7 @@ def test_mask_radii_zeroes_the_dropped_and_nothing_else(shape: tuple[int, ...], 
     assert masked.dtype == dtype
     assert torch.equal(masked[keep], radii[keep])
     assert not masked[~keep].any()
-    with pytest.raises(ValueError, match="6 Gaussians of the last call"):
+    with pytest.raises(ValueError, match="6 Gaussians"):
         dropout.mask_radii(radii[:5])
     dropout.eval()
     dropout(torch.full((6,), 0.5))

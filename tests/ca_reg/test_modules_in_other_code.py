@@ -259,13 +259,13 @@ def test_a_capture_neither_waits_for_the_card_nor_copies_to_it(card, capture, te
 def test_a_graph_that_would_keep_the_rate_of_its_capture_is_refused(capture):
     module = GaussianDropout(RAMP)
     module.set_step(50)
-    with pytest.raises(RuntimeError, match=r"keep p of the step at which it is captured.*LinearRamp.*constant rate"):
+    with pytest.raises(RuntimeError, match=r"keep p .*captured.*LinearRamp"):
         module(OPACITY)
 
 
 def test_a_graph_that_would_keep_the_degree_of_its_capture_is_refused(capture):
     module, x = SHDropout(0.2, until=(20, 40)), Params(OPACITY, sh=torch.ones(40, 16, 3))
-    with pytest.raises(RuntimeError, match=r"keep the degree 1 of the step 30 at which it is captured.*\(20, 40\)"):
+    with pytest.raises(RuntimeError, match=r"degree 1 .*step 30 .*captured.*\(20, 40\)"):
         module(x._replace(step=30))
     last = x._replace(step=40)  # nothing is dropped any more, at no later step either
     assert module(last) is last
@@ -276,7 +276,7 @@ def test_a_graph_that_would_keep_the_neighbors_of_its_capture_is_refused(request
     module, x = parse(text), Params(OPACITY, means=torch.rand(40, 3), step=30)
     module(x)  # the neighbors are known by now
     request.getfixturevalue("capture")
-    with pytest.raises(RuntimeError, match="keep what surrounds the Gaussians at the step at which it is captured"):
+    with pytest.raises(RuntimeError, match=r"surrounds the Gaussians .*captured"):
         module(x._replace(step=31))
 
 

@@ -376,16 +376,16 @@ def test_the_renderers_clamp_moves_a_noisy_sample_by_at_most_a_99th_of_the_range
         ({"alphas": torch.full((4, 5), torch.nan)}, ValueError, r"in \[0, 1\]"),
         ({"alphas": torch.tensor(0.5)}, ValueError, "scalar"),
         ({"alphas": torch.ones(4, 5, dtype=torch.int64)}, TypeError, "floating-point"),
-        ({"alphas": [0.5]}, TypeError, "alphas must be a torch tensor"),
+        ({"alphas": [0.5]}, TypeError, "alphas .*torch tensor"),
         ({"colors": torch.rand(4, 6, 3)}, ValueError, "shape of alphas"),
         ({"colors": torch.rand(4, 5)}, ValueError, "shape of alphas"),
         ({"colors": torch.rand(4, 5, 3, dtype=torch.float64)}, TypeError, "same dtype"),
-        ({"colors": 1.0}, TypeError, "colors must be a torch tensor"),
+        ({"colors": 1.0}, TypeError, "colors .*torch tensor"),
         ({"background": torch.rand(2)}, ValueError, "background must have shape"),
         ({"background": torch.rand(1, 3)}, ValueError, "background must have shape"),
-        ({"background": 1.0}, TypeError, "background must be a tensor"),
-        ({"multiplier": Multiplier(torch.ones(4), 0.0)}, ValueError, "mean of the multiplier must broadcast"),
-        ({"multiplier": Multiplier(1.0, torch.ones(2, 4, 5))}, ValueError, "variance of the multiplier must broadcast"),
+        ({"background": 1.0}, TypeError, "background .*tensor"),
+        ({"multiplier": Multiplier(torch.ones(4), 0.0)}, ValueError, "mean .*broadcast"),
+        ({"multiplier": Multiplier(1.0, torch.ones(2, 4, 5))}, ValueError, "variance .*broadcast"),
     ],
 )
 def test_wrong_arguments_are_refused(change, error, message):
@@ -399,13 +399,13 @@ def test_wrong_arguments_are_refused(change, error, message):
 def test_colors_that_are_not_finite_are_refused_in_the_padding_too(function, bad):
     alphas, colors, _ = lists(3, 5)
     alphas[1, 4], colors[1, 4, 2] = 0.0, bad
-    with pytest.raises(ValueError, match="colors must be finite"):
+    with pytest.raises(ValueError, match=r"colors .*finite"):
         function(alphas, colors, Multiplier.dropout(0.3))
 
 
 def test_a_background_that_is_not_finite_is_refused():
     alphas, colors, _ = lists(3, 5)
-    with pytest.raises(ValueError, match="background must be finite"):
+    with pytest.raises(ValueError, match=r"background .*finite"):
         pixel_moments(alphas, colors, Multiplier.dropout(0.3), background=torch.tensor([0.0, math.nan, 0.0]).double())
 
 
@@ -416,5 +416,5 @@ def test_finite_colors_whose_sum_overflows_are_no_mistake():
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_short_dtypes_are_refused(dtype):
-    with pytest.raises(TypeError, match=r"float32 or float64, got torch\.b?float16; convert it with \.float"):
+    with pytest.raises(TypeError, match=r"got torch\.b?float16; .*\.float"):
         alpha_moments(torch.full((5,), 0.5, dtype=dtype), Multiplier.dropout(0.5))

@@ -109,7 +109,7 @@ def test_views_may_come_from_any_iterable(tmp_path):
     (expected,) = run(make(tmp_path / "lists"), 10, 11)
     views = {name: (view for view in group) for name, group in VIEWS.items()}
     assert run(make(tmp_path / "iterators", views=views), 10, 21)[0] == expected
-    with pytest.raises(ValueError, match=r"got \{'test': 0\}; leave out groups without views"):
+    with pytest.raises(ValueError, match=r"\{'test': 0\}; leave out"):
         make(tmp_path, views={"test": iter(())})
 
 
@@ -292,7 +292,7 @@ def test_a_full_disk_leaves_whole_lines_and_names_the_log(tmp_path, full_disk):
     before = (tmp_path / "ca.jsonl").read_bytes()
     with (
         full_disk(len(before) + 20),
-        pytest.raises(OSError, match=r"too large \(the last measurement is not logged\): '.*ca\.jsonl'$"),
+        pytest.raises(OSError, match=r"not logged\): '.*ca\.jsonl'$"),
     ):
         monitor(20, OPACITY)
     assert (tmp_path / "ca.jsonl").read_bytes() == before

@@ -73,12 +73,12 @@ def test_a_column_of_opacities_behaves_like_a_vector():
 
 @pytest.mark.parametrize("sigma", [-0.1, float("nan"), float("inf")])
 def test_sigmas_outside_the_range_are_refused(sigma):
-    with pytest.raises(ValueError, match="sigma must be finite"):
+    with pytest.raises(ValueError, match=r"sigma .*finite"):
         opacity_noise(OPACITY, sigma)
 
 
 def test_noise_that_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match=r"noise must have shape \(6,\)"):
+    with pytest.raises(ValueError, match=r"noise .*shape \(6,\)"):
         apply_opacity_noise(OPACITY, torch.zeros(6, 1))
 
 

@@ -212,10 +212,10 @@ def test_printing_shows_the_arguments():
     [
         ({"moments_fn": None}, TypeError, "moments_fn must be callable"),
         ({"multiplier": 0.2}, TypeError, "Multiplier.dropout"),
-        ({"weight": -1.0}, ValueError, "weight must be finite and at least 0"),
-        ({"weight": Constant(-1.0)}, ValueError, "weight must be finite and at least 0"),
-        ({"weight": "1"}, TypeError, "weight must be a real number"),
-        ({"layout": "WHC"}, ValueError, "layout must be one of"),
+        ({"weight": -1.0}, ValueError, "weight .*at least 0"),
+        ({"weight": Constant(-1.0)}, ValueError, "weight .*at least 0"),
+        ({"weight": "1"}, TypeError, "weight .*real number"),
+        ({"layout": "WHC"}, ValueError, "layout .*one of"),
     ],
 )
 def test_wrong_arguments_are_refused_at_construction(change, error, message):
@@ -229,7 +229,7 @@ def test_wrong_calls_are_refused():
     dropout = Multiplier.dropout(0.2)
     with pytest.raises(ValueError, match="sigmoid"):
         CAPenalty(cloud.moments, dropout)(torch.tensor([-1.0, 0.5, 0.5, 0.5, 0.5]).double(), cloud.colors)
-    with pytest.raises(TypeError, match="must return a Multiplier"):
+    with pytest.raises(TypeError, match="return a Multiplier"):
         CAPenalty(cloud.moments, lambda o: o)(cloud.opacity, cloud.colors)
     with pytest.raises(TypeError, match="without variance"):
         CAPenalty(lambda *_: {"mean": cloud.target, "alpha_mean": cloud.target[0]}, dropout)(cloud.opacity, None)

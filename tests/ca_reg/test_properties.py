@@ -102,7 +102,7 @@ def test_each_gaussian_has_its_own_rate_in_every_shape_and_type(shape, dtype):
         lambda p: F.apply_dropout(opacity, kept, p=p, compensate=True),
         lambda p: F.draw_keep_mask(3, p),
     ):
-        with pytest.raises(ValueError, match=r"p must have shape \(3,\)"):
+        with pytest.raises(ValueError, match=r"\bp .*shape \(3,\)"):
             call(rates[:1])
 
 

@@ -44,21 +44,21 @@ def test_a_class_in_a_file_of_the_working_directory(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("dropot(0.2)", "there is no regularizer 'dropot'; choose one of .*dropout"),
-        ("dropout(", "cannot be read as regularizers"),
+        ("dropot(0.2)", "no regularizer 'dropot'; .*dropout"),
+        ("dropout(", "as regularizers"),
         ("dropout(0.2) - noise(0.8)", "is no regularizer; write dropout"),
         ("dropout(1.5)", r"dropout\(1.5\)\': p must be in \[0, 1\)"),
         ("dropout(rate=0.2)", "unexpected keyword argument 'rate'"),
         ("dropout(__import__('os').getcwd())", r"getcwd\(\)\" is none of ramp, .*Python's literals"),
         ("dropout(**{'p': 0.2})", "keywords must be strings"),
-        ("os:getcwd()", "os:getcwd is no subclass of Regularizer"),
-        ("torch.nn:Dropout(0.2)", "is no subclass of Regularizer"),
+        ("os:getcwd()", "os:getcwd .*no subclass"),
+        ("torch.nn:Dropout(0.2)", "no subclass of Regularizer"),
         ("no_such_module:Thing", "cannot be had: No module named 'no_such_module'"),
         ("ca_reg:NoSuchClass", "cannot be had"),
         ("+".join(["dropout(0.1)"] * 9) + "+(", "cannot be read"),
         ("(lambda: 0)()", "is no regularizer"),
-        ("dropout(1" + "0" * 309 + ")", "p must be finite, got 1000"),
-        ("segs(stop=None)", "stop must be an integer"),
+        ("dropout(1" + "0" * 309 + ")", "p .*finite, got 1000"),
+        ("segs(stop=None)", "stop .*integer"),
         ("noise(sigma=0.8, sigma=0.1)", "sigma is given twice"),
         ("dropout(ramp(0, 0.2, 0, end_step=5, end_step=9))", "end_step is given twice"),
         # Deeper than Python's limit for recursion:
@@ -82,7 +82,7 @@ def test_a_name_is_entered_once():
     registry = Registry("animal", object)
     registry.register("cat")(dict)
     registry.register("cat")(dict)
-    with pytest.raises(ValueError, match="there is a animal 'cat' already"):
+    with pytest.raises(ValueError, match="animal 'cat' already"):
         registry.register("cat")(list)
 
 

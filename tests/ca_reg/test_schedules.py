@@ -50,7 +50,7 @@ def test_numbers_become_constants_and_callables_stay():
         (lambda: LinearRamp(0.0, 0.2, 10, 10), "must come after"),
         (lambda: ExponentialDecay(0.2, 0.1, 10, 10), "must come after"),
         (lambda: ExponentialDecay(0.2, 0.0, 0, 10), "above 0"),
-        (lambda: ExponentialDecay(10**400, 0.1, 0, 10), "value must be finite, got 1000"),
+        (lambda: ExponentialDecay(10**400, 0.1, 0, 10), "value .*finite, got 1000"),
         (lambda: LinearRamp(0.0, 0.2, -1, 10), "at least 0"),
         (lambda: StartStop(0.2, start=5, stop=5), "must come after"),
     ],
@@ -61,5 +61,5 @@ def test_schedules_that_make_no_sense_are_refused(make, message):
 
 
 def test_a_decay_without_an_end_is_refused():
-    with pytest.raises(TypeError, match="stop must be an integer, got NoneType"):
+    with pytest.raises(TypeError, match=r"stop .*got NoneType"):
         ExponentialDecay(0.2, 0.1, 0, None)

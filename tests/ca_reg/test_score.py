@@ -240,7 +240,7 @@ def test_a_white_on_black_pass_replaces_the_alpha():
 
 
 def test_without_any_alpha_the_error_names_the_three_ways():
-    with pytest.raises(ValueError, match=r"\(image, alpha\).*mapping or object.*alpha_fn"):
+    with pytest.raises(ValueError, match=r"\(image, alpha\).*mapping.*alpha_fn"):
         CAScore(lambda o, v: MANY(o, v)[0])(MANY.opacity, None)
 
 
@@ -260,13 +260,13 @@ def test_wrong_opacities_are_refused():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"samples": 1}, "samples must be at least 2"),
+        ({"samples": 1}, "samples .*at least 2"),
         ({"p": 1.0}, "p must be in"),
         ({"drop_rate": 1.0}, "drop_rate must be in"),
         ({"samples": 3, "ddof": 3}, "ddof must be below"),
         ({"threshold": math.nan}, "threshold must be finite"),
-        ({"layout": "WHC"}, "layout must be one of"),
-        ({"seed": -1}, "seed must be at least 0"),
+        ({"layout": "WHC"}, "layout .*one of"),
+        ({"seed": -1}, "seed .*at least 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(arguments, message):
@@ -349,9 +349,9 @@ def test_another_view_does_not_change_the_masks_of_the_first():
 
 
 def test_results_of_different_scores_are_not_averaged():
-    with pytest.raises(ValueError, match="one set of settings"):
+    with pytest.raises(ValueError, match="one set"):
         summarize([CAScore(MANY, samples=k)(MANY.opacity, None) for k in (4, 5)])
-    with pytest.raises(ValueError, match="one set of settings"):
+    with pytest.raises(ValueError, match="one set"):
         summarize([])
 
 

@@ -236,7 +236,7 @@ def test_a_batch_of_another_length_is_refused(make):
         def render_batch(self, opacities, view):
             return torch.rand(1, 3, 4, 5), torch.ones(1, 4, 5)
 
-    with pytest.raises(ValueError, match=r"for each of the \d sets of opacities, got 1"):
+    with pytest.raises(ValueError, match=r"\d sets .*got 1"):
         make(OneForAll())(torch.full((9,), 0.5), None)
 
 
@@ -295,7 +295,7 @@ def test_a_depth_map_in_the_place_of_the_alpha_is_refused(depth, method):
         image, alpha = render(opacity, view)
         return image, depth * alpha / alpha.amax()
 
-    with pytest.raises(ValueError, match=f"alpha must be in .0, 1., got values up to {depth:g}"):
+    with pytest.raises(ValueError, match=f"alpha .*up to {depth:g}"):
         method(with_depth, **SETTINGS)(OPACITY, None)
 
 
@@ -303,7 +303,7 @@ def test_an_expected_alpha_above_1_is_refused():
     def with_depth(*arguments):
         return {**moments(*arguments), "alpha_mean": torch.full((HEIGHT, WIDTH), 5.0)}
 
-    with pytest.raises(ValueError, match="alpha must be in"):
+    with pytest.raises(ValueError, match=r"alpha .*\[0, 1\]"):
         CAScore.exact(with_depth)(OPACITY, None)
 
 

@@ -217,7 +217,7 @@ def test_methods_are_not_averaged_with_one_another():
         CAScore.exact(model.moments, neutral=True, threshold=THRESHOLD),
     ]
     for pair in itertools.combinations([score(model.opacity, None) for score in scores], 2):
-        with pytest.raises(ValueError, match="one set of settings, got 2"):
+        with pytest.raises(ValueError, match=r"one set .*got 2"):
             summarize(pair)
 
 
@@ -378,8 +378,8 @@ def test_the_paper_s_protocol_finds_four_fifths():
         (CAScore, {"render_fn": None}, TypeError, "render_fn must be callable"),
         (CAScore, {"render_fn": MANY.render, "neutral": True}, TypeError, "neutral"),
         (CAScore, {"render_fn": MANY.render, "max_samples": 70}, TypeError, "max_samples"),
-        (CAScore, {"render_fn": MANY.render, "samples": 3, "ddof": 3}, ValueError, "ddof must be below samples"),
-        (CAScore, {"render_fn": MANY.render, "samples": 1}, ValueError, "samples must be at least 2"),
+        (CAScore, {"render_fn": MANY.render, "samples": 3, "ddof": 3}, ValueError, "ddof .*below samples"),
+        (CAScore, {"render_fn": MANY.render, "samples": 1}, ValueError, "samples .*at least 2"),
         (CAScore.exact, {"moments_fn": True}, TypeError, "moments_fn must be callable"),
         (CAScore.exact, {"moments_fn": MANY.moments, "samples": 5}, TypeError, "samples"),
         (CAScore.exact, {"moments_fn": MANY.moments, "drop_rate": 1.0}, ValueError, "drop_rate"),

@@ -99,7 +99,7 @@ def test_a_monitor_takes_what_its_score_takes(tmp_path):
     with CAMonitor(score, tmp_path, views={"test": [None]}, every=1, psnr=psnr) as monitor:
         record = monitor(1, x)
         assert (record["ca/test"], record["psnr/test"], record["gaussians"]) == (score(x, None).value, 30.0, 3)
-        with pytest.raises(ValueError, match=r"ByDepth needs means.*pass Params\(opacities"):
+        with pytest.raises(ValueError, match=r"ByDepth needs means.*Params\("):
             monitor(2, OPACITY)
 
 
@@ -113,16 +113,16 @@ def test_a_score_does_not_ask_for_the_mode_of_the_regularizer():
 
 
 def test_what_a_score_cannot_render_is_refused():
-    with pytest.raises(TypeError, match=r"must be a ca_reg.Regularizer, got Dropout: wrap it in ca_reg.Chain"):
+    with pytest.raises(TypeError, match=r"ca_reg\.Regularizer, got Dropout: .*ca_reg\.Chain"):
         CAScore(render, regularizer=nn.Dropout(0.5))
     score = CAScore(render, regularizer=Chain(nn.Dropout(0.5)))
-    with pytest.raises(TypeError, match=r"forward of Dropout takes no argument generator.* Add generator=None to it"):
+    with pytest.raises(TypeError, match=r"Dropout .*argument generator.*generator=None"):
         score(OPACITY, None)
     score = CAScore(render, regularizer=Chain(GaussianDropout(0.5), ScaleNoise(0.5)), threshold=0.1)
-    with pytest.raises(ValueError, match="Chain changes other parameters than opacities"):
+    with pytest.raises(ValueError, match="Chain changes other"):
         score(Params(OPACITY, scales=torch.ones(3, 3)), None)
     for rates in ({"p": torch.tensor([0.1, 0.2, 0.3])}, {"drop_rate": torch.tensor([0.1, 0.2, 0.3])}):
-        with pytest.raises(TypeError, match=f"{next(iter(rates))} must be a real number, got Tensor"):
+        with pytest.raises(TypeError, match=f"{next(iter(rates))} .*number, got Tensor"):
             CAScore(render, **rates)
 
 
@@ -142,7 +142,7 @@ def test_the_protocol_is_the_score_of_uniform_dropout():
 @pytest.mark.parametrize(
     ("make", "arguments", "message"),
     [
-        (CAScore, {"regularizer": ByDepth(), "p": 0.2}, "do not apply to the draws of a regularizer"),
+        (CAScore, {"regularizer": ByDepth(), "p": 0.2}, "draws of a regularizer"),
         (CAScore, {"regularizer": ByDepth(), "drop_rate": 0.5}, "do not apply"),
         (CAScore, {"regularizer": ByDepth()}, r"ByDepth needs means .* Params\(opacities, means"),
         (CAScore.adaptive, {"regularizer": Pair(), "relative_error": 0.1}, r"sample with CAScore\(render_fn\)"),

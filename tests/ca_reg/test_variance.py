@@ -82,8 +82,8 @@ def test_what_is_not_finite_is_refused_in_the_padding_too(bad):
     weights, colors = torch.full((4, 3), 0.2), torch.full((4, 3, 3), 0.5)
     weights[2, 1] = 0.0
     colors[2, 1, 0] = bad
-    with pytest.raises(ValueError, match="colors must be finite"):
+    with pytest.raises(ValueError, match=r"colors .*finite"):
         color_variance(weights, colors)
     weights[2, 1] = bad
-    with pytest.raises(ValueError, match="weights must be finite"):
+    with pytest.raises(ValueError, match=r"weights .*finite"):
         color_variance(weights, torch.full((4, 3, 3), 0.5))

@@ -16,7 +16,7 @@ from reference_trainer.evaluation.lpips import load_lpips
 from reference_trainer.evaluation.tables import comparison_table, evaluation_table, summary
 from reference_trainer.model.ply import load_ply
 from reference_trainer.runs.folder import read_results, read_run_settings
-from reference_trainer.runs.grid import _line
+from reference_trainer.runs.grid import outcome_line
 from reference_trainer.scenes.colmap import read_colmap
 from reference_trainer.scenes.images import LARGEST_IMAGE, read_image
 from reference_trainer.scenes.load import file_split
@@ -109,7 +109,7 @@ def _results_fit(results: Any) -> None:
     assert comparison_table({"a": [results]})
     assert evaluation_table(results)
     assert summary(results)
-    assert _line(results, "now")
+    assert outcome_line(results, "now")
 
 
 TARGETS = (

@@ -29,7 +29,7 @@ def test_colmap_binary(tmp_path, name, change):
     path = tmp_path / f"{name}.bin"
     data = path.read_bytes()
     path.write_bytes(struct.pack("<Q", struct.unpack_from("<Q", data)[0] + change) + data[8:])
-    with pytest.raises(ValueError, match=rf"{name}\.bin is (damaged|truncated) or not a COLMAP file"):
+    with pytest.raises(ValueError, match=rf"{name}\.bin is (damaged|truncated)"):
         read_colmap(tmp_path)
 
 
@@ -50,11 +50,11 @@ def test_a_number_given_twice_hides_no_record(tmp_path):
     samples.write_colmap_binary(tmp_path)
     images = (tmp_path / "images.bin").read_bytes()
     (tmp_path / "images.bin").write_bytes(images[:8] + struct.pack("<i", 2) + images[12:])
-    with pytest.raises(ValueError, match="two images have the same number"):
+    with pytest.raises(ValueError, match="same number"):
         read_colmap(tmp_path)
     cameras = (tmp_path / "cameras.bin").read_bytes()
     (tmp_path / "cameras.bin").write_bytes(cameras[:8] + struct.pack("<i", 7) + cameras[12:])
-    with pytest.raises(ValueError, match=r"cameras\.bin: it has camera 7 twice"):
+    with pytest.raises(ValueError, match=r"cameras\.bin: .*camera 7 twice"):
         read_colmap(tmp_path)
 
 
@@ -83,7 +83,7 @@ def test_a_header_line_that_is_not_understood_does_not_shift_the_columns(tmp_pat
     samples.write_model(tmp_path)
     path = tmp_path / "model.ply"
     path.write_bytes(path.read_bytes().replace(b"property float nx\n", line))
-    with pytest.raises(ValueError, match=r"model\.ply: the header line .* is not one of a PLY file"):
+    with pytest.raises(ValueError, match=r"model\.ply: the header line"):
         load_ply(path)
 
 
@@ -104,7 +104,7 @@ def test_the_header_of_an_npy_file_is_not_believed_about_its_length(tmp_path):
     path = tmp_path / "poses_bounds.npy"
     path.write_bytes(b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**30) + b"{}")
     tracemalloc.start()
-    with pytest.raises(ValueError, match="not a NumPy array"):
+    with pytest.raises(ValueError, match="NumPy array"):
         read_llff(path, tmp_path / "images")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -114,7 +114,7 @@ def test_the_header_of_an_npy_file_is_not_believed_about_its_length(tmp_path):
 @pytest.mark.parametrize("frames", ['{"a": 1}', '"abc"', "{}", '""', "null", "3"])
 def test_frames_that_are_no_list(tmp_path, frames):
     (tmp_path / "transforms.json").write_text(f'{{"camera_angle_x": 0.7, "frames": {frames}}}')
-    with pytest.raises(ValueError, match="frames must be a list"):
+    with pytest.raises(ValueError, match=r"frames .*list"):
         read_transforms(tmp_path / "transforms.json")
 
 
@@ -124,7 +124,7 @@ def test_an_image_of_too_many_pixels_is_not_decoded(tmp_path):
     for width in (side, 10 * side, 100 * side):
         header_of_picture = struct.pack("<IiiHHIIiiII", 40, width, side, 1, 24, 0, 0, 0, 0, 0, 0)
         (tmp_path / "a.bmp").write_bytes(header + header_of_picture)
-        with pytest.raises(ValueError, match=r"a\.bmp (has \d+x\d+ pixels|is not a readable image)"):
+        with pytest.raises(ValueError, match=r"a\.bmp .*(\d+x\d+ pixels|readable)"):
             read_image(tmp_path / "a.bmp")
 
 
@@ -140,7 +140,7 @@ def test_a_compressed_checkpoint_is_not_unpacked(tmp_path):
 
 def test_a_tensor_that_repeats_one_number_is_not_believed_about_its_size(tmp_path):
     torch.save({"x": [torch.zeros(()).expand(10**6, 10**6)]}, tmp_path / "large.pt")
-    with pytest.raises(ValueError, match=r"large\.pt .*a tensor of shape \(1000000, 1000000\) has 4 bytes"):
+    with pytest.raises(ValueError, match=r"large\.pt .*\(1000000, 1000000\) has 4 bytes"):
         load_tensors(tmp_path / "large.pt")
 
 
@@ -186,7 +186,7 @@ def test_text_that_ends_within_a_number(tmp_path, cut):
         write(tmp_path)
         path = tmp_path / name
         path.write_bytes(path.read_bytes()[:-cut])
-        with pytest.raises(ValueError, match=rf"{name}.*(last line has no end|numbers each)"):
+        with pytest.raises(ValueError, match=f"{name}.*(no end|numbers each)"):
             read(path)
 
 
@@ -196,7 +196,7 @@ def test_a_line_of_one_number_does_not_stand_for_a_line_of_equal_ones(tmp_path):
     lines = path.read_bytes().split(b"\n")
     at = lines.index(b"end_header") + 5
     path.write_bytes(b"\n".join([*lines[:at], b"0.5", *lines[at + 1 :]]))
-    with pytest.raises(ValueError, match=r"model\.ply: the vertex lines do not hold 26 numbers each: got 1"):
+    with pytest.raises(ValueError, match=r"model\.ply: .*26 numbers each: got 1"):
         load_ply(path)
 
 
@@ -206,7 +206,7 @@ def test_the_checksums_of_a_png_are_compared(tmp_path):
     data = path.read_bytes()
     at = data.index(b"IEND") - 12  # the last bytes of the compressed pixels stand before their checksum and a length
     path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
-    with pytest.raises(ValueError, match="picture is not a readable image"):
+    with pytest.raises(ValueError, match=r"picture .*readable"):
         read_image(path)
 
 
@@ -216,7 +216,7 @@ def test_a_damaged_log_is_not_shortened_by_a_resumed_run(tmp_path):
     damaged = path.read_bytes().replace(b'"step": 20', b'"st\xffp": 20')
     path.write_bytes(damaged)
     score = CAScore(lambda opacity, view: (torch.zeros(3, 1, 1), torch.ones(1, 1)))
-    with pytest.raises(ValueError, match=r"ca\.jsonl, line 2, is no measurement"):
+    with pytest.raises(ValueError, match=r"ca\.jsonl, line 2"):
         CAMonitor(score, tmp_path, views={"test": [0]}, resume_step=40)
     assert path.read_bytes() == damaged
 
@@ -229,7 +229,7 @@ def test_a_tiff_with_lost_strips_is_refused(tmp_path):
     assert height in data or struct.pack("<HHI", 257, 3, 1) in data
     at = data.index(struct.pack("<H", 257)) + 8
     path.write_bytes(data[:at] + struct.pack("<H", 2400) + data[at + 2 :])
-    with pytest.raises(ValueError, match=r"picture is not a readable image: it holds 768 of its 32x2400 pixels"):
+    with pytest.raises(ValueError, match=r"picture .*768 of its 32x2400 pixels"):
         read_image(path)
 
 
@@ -245,7 +245,7 @@ def test_lists_of_other_things_than_names(tmp_path, bad, name):
     path = tmp_path / "split.json"
     content = json.loads(path.read_text()) | {name: json.loads(bad)}
     path.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=rf"split\.json: the list '{name}' must hold names"):
+    with pytest.raises(ValueError, match=rf"split\.json: .*'{name}' must hold names"):
         file_split(path, ["r_0.png", "r_1.png", "r_2.png"], 1)
 
 
@@ -253,7 +253,7 @@ def test_a_name_that_no_file_system_takes(tmp_path):
     samples.write_blender(tmp_path)
     path = tmp_path / "transforms.json"
     path.write_text(path.read_text().replace("r_1", "r" * 5000).replace('"w": 8,', '"width": 8,'))
-    with pytest.raises(ValueError, match=r"transforms\.json is not a valid transforms file: .*too long"):
+    with pytest.raises(ValueError, match=r"transforms\.json .*too long"):
         read_transforms(path)
 
 
@@ -261,7 +261,7 @@ def test_a_header_line_that_is_not_understood_does_not_shift_the_coordinates(tmp
     samples.write_points(tmp_path)
     path = tmp_path / "points.ply"
     path.write_bytes(path.read_bytes().replace(b"property float y\n", b"property float y\npropertu float quality\n"))
-    with pytest.raises(ValueError, match=r"points\.ply: the header line .* is not one of a PLY file"):
+    with pytest.raises(ValueError, match=r"points\.ply: the header line"):
         ply_points(path)
 
 
@@ -269,7 +269,7 @@ def test_a_file_of_lines_is_not_taken_for_a_header(tmp_path):
     path = tmp_path / "points.ply"
     path.write_bytes(b"ply\n" + b"a\n" * 1_000_000)
     tracemalloc.start()
-    with pytest.raises(ValueError, match="is not a PLY file"):
+    with pytest.raises(ValueError, match="not a PLY"):
         ply_points(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()

@@ -70,8 +70,7 @@ def test_what_is_wrong_is_reported(tmp_path, wrong, inputs, said):
 def test_half_a_file_is_reported(tmp_path):
     defects = fuzz(target(numbers), tmp_path, range(100)).defects
     assert defects
-    others = "foreign: accepted a file of another format"
-    assert {text for _, text in defects} == {"cut: accepted with other content", others}
+    assert {text.partition(":")[0] for _, text in defects} == {"cut", "foreign"}
     # A format with checksums may not be read wrongly at all.
     assert len(fuzz(target(numbers, checksummed=True), tmp_path, range(100)).defects) > len(defects)
 

@@ -89,7 +89,7 @@ def test_postscript_under_the_name_of_a_picture_reaches_no_interpreter(tmp_path,
         file.load()
     assert (tmp_path / "started").exists()  # the test would see it
     (tmp_path / "started").unlink()
-    with pytest.raises(ValueError, match=r"x\.png is not a readable image: .* PNG, JPEG, BMP, TIFF or WebP"):
+    with pytest.raises(ValueError, match=r"x\.png .*readable.*: .*WebP"):
         read(tmp_path / "x.png")
     assert not (tmp_path / "started").exists()
 
@@ -113,7 +113,7 @@ def test_a_few_bytes_do_not_take_a_gigabyte(tmp_path, name, function):
             evil.writestr(item, content if item.endswith("data.pkl") else good.read(item))
     (tmp_path / "evil.pt").replace(tmp_path / name)
     tracemalloc.start()
-    with pytest.raises(ValueError, match="not only tensors, numbers and strings"):
+    with pytest.raises(ValueError, match="not only tensors"):
         READERS[name](tmp_path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -146,7 +146,7 @@ def test_what_stands_at_two_places_is_not_unfolded(tmp_path, name, kind):
         for item in good.namelist():
             evil.writestr(item, nested(kind, 40) if item.endswith("data.pkl") else good.read(item))
     (tmp_path / "evil.pt").replace(tmp_path / name)
-    with pytest.raises(ValueError, match=r"holds one (list|dict|tuple|OrderedDict) at two places"):
+    with pytest.raises(ValueError, match=r"\w+ at two places"):
         READERS[name](tmp_path)
 
 
@@ -161,7 +161,7 @@ def test_the_nested_pickles_are_what_they_are_said_to_be():
 @pytest.mark.parametrize("archive", [True, False])
 def test_a_pickle_without_end_is_not_followed(tmp_path, archive):
     torch.save({"x": [[] for _ in range(100_000)]}, tmp_path / "x.pt", _use_new_zipfile_serialization=archive)
-    with pytest.raises(ValueError, match="describes its tensors in more than"):
+    with pytest.raises(ValueError, match="its tensors in more"):
         load_tensors(tmp_path / "x.pt")
 
 
@@ -172,7 +172,7 @@ def test_colmap_names_stay_in_the_image_folder(tmp_path, name):
     (tmp_path / "secret.png").write_bytes((tmp_path / "images" / "r_1.png").read_bytes())
     file = tmp_path / "images.txt"
     file.write_text(file.read_text().replace("r_1.png", name))
-    with pytest.raises(ValueError, match="leads out of the scene folder"):
+    with pytest.raises(ValueError, match="leads out"):
         colmap_frames(read_colmap(tmp_path), tmp_path / "images")
 
 
@@ -187,7 +187,7 @@ def test_transforms_stay_in_the_scene_folder(tmp_path, name):
     content = json.loads(file.read_text())
     content["frames"][1]["file_path"] = name
     file.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"transforms\.json.*(leads out of the scene folder|the scene folder itself)"):
+    with pytest.raises(ValueError, match=r"transforms\.json.*(leads out|itself)"):
         read_transforms(file)
 
 
@@ -197,7 +197,7 @@ def test_points_stay_in_the_scene_folder(tmp_path, points):
     folder.mkdir()
     samples.write_llff(folder)
     samples.write_points(tmp_path)
-    with pytest.raises(ValueError, match="leads out of the scene folder"):
+    with pytest.raises(ValueError, match="leads out"):
         load_scene(SceneOptions(folder, points=points, views=1))
 
 

@@ -242,11 +242,11 @@ def test_mistakes_are_told(monkeypatch):
     assert unregularized(wrapped) is unregularized(rasterization) is rasterization
     with pytest.raises(ValueError, match="regularized already"):
         regularized(wrapped, GaussianDropout(0.2))
-    with pytest.raises(TypeError, match="must be a torch module, got float"):
+    with pytest.raises(TypeError, match="module, got float"):
         regularized(rasterization, 0.2)
     with pytest.raises(TypeError, match="no argument opacities"):
         regularized(lambda image: image, GaussianDropout(0.2))
-    with pytest.raises(TypeError, match="missing a required argument"):
+    with pytest.raises(TypeError, match=r"missing .*argument"):
         wrapped()
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(ImportError, match=r"pip install 'ca_reg\[gsplat\]'"):

@@ -38,9 +38,9 @@ def package(monkeypatch):
     pytest.importorskip("gsplat.cuda._torch_impl", exc_type=ImportError)
     package = gsplat_stand_in.package(max_alpha=0.99)
     monkeypatch.setattr(module, "load_gsplat", lambda device: package)
-    module._largest_alpha.cache_clear()
+    module.largest_alpha.cache_clear()
     yield package
-    module._largest_alpha.cache_clear()
+    module.largest_alpha.cache_clear()
 
 
 def test_render_is_what_a_score_takes_and_is_not_regularized(package):
@@ -173,7 +173,7 @@ def test_the_arguments_are_those_of_the_package():
 def test_a_cpu_is_refused():
     model, view = model_of(random_scene(3, WIDTH, HEIGHT, seed=0))
     for method in (model.render, model.rasterized, model.lists):
-        with pytest.raises(RuntimeError, match="on CUDA devices only, and the Gaussians are on cpu"):
+        with pytest.raises(RuntimeError, match=r"CUDA .*on cpu"):
             method(torch.ones(3), view)
 
 

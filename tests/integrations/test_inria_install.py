@@ -41,7 +41,7 @@ def test_the_classes_are_put_back_exactly(rasterizer, model_class):
 def test_foreign_patches_are_respected(rasterizer):
     original = vars(rasterizer)["forward"]
     rasterizer.forward = lambda *args, **kwargs: original(*args, **kwargs)
-    with pytest.raises(TypeError, match="no argument means3D or opacities"):
+    with pytest.raises(TypeError, match="means3D or opacities"):
         RasterizerHook(GaussianDropout(0.2), rasterizer=rasterizer).install()
     rasterizer.forward = original
     hook = RasterizerHook(GaussianDropout(0.2), rasterizer=rasterizer).install()
@@ -51,7 +51,7 @@ def test_foreign_patches_are_respected(rasterizer):
         return ours(self, *args, **kwargs)
 
     rasterizer.forward = foreign
-    with pytest.raises(RuntimeError, match="replaced again after ca_reg had wrapped it"):
+    with pytest.raises(RuntimeError, match="replaced again"):
         hook.uninstall()
     assert rasterizer.forward is foreign
     rasterizer.forward = ours
@@ -114,7 +114,7 @@ def test_without_a_rasterizer_the_first_call_says_what_to_do(monkeypatch):
     monkeypatch.delitem(sys.modules, "diff_gaussian_rasterization", raising=False)
     if any(importlib.util.find_spec(f"diff_gaussian_rasterization{suffix}") for suffix in ("", "_abs")):
         pytest.skip("a rasterizer is installed")
-    with pytest.raises(ImportError, match=r"run the code base without CUDA: python -m ca_reg\.integrations\.run --cpu"):
+    with pytest.raises(ImportError, match=r"python -m ca_reg\.integrations\.run --cpu"):
         RasterizerHook(GaussianDropout(0.2)).install()
 
 
@@ -123,13 +123,13 @@ def test_arguments_are_checked(rasterizer):
         RasterizerHook(GaussianDropout(0.2), scope="first")
     with pytest.raises(ValueError, match="empty"):
         RasterizerHook(nn.Sequential())
-    with pytest.raises(ValueError, match="steps must be one of updates, parameters"):
+    with pytest.raises(ValueError, match=r"steps .*updates, parameters"):
         RasterizerHook(GaussianDropout(0.2), steps="renders")
-    with pytest.raises(ValueError, match="patience must be at least 0"):
+    with pytest.raises(ValueError, match=r"patience .*at least 0"):
         RasterizerHook(GaussianDropout(0.2), patience=-1)
-    with pytest.raises(TypeError, match="Linear takes no argument generator"):
+    with pytest.raises(TypeError, match=r"Linear .*argument generator"):
         RasterizerHook(nn.Sequential(GaussianDropout(0.2), nn.Linear(1, 1)))
-    with pytest.raises(TypeError, match="must be a torch module, got float"):
+    with pytest.raises(TypeError, match="module, got float"):
         RasterizerHook(0.2)
 
 
@@ -178,7 +178,7 @@ def test_a_named_tuple_stays_one():
 
 def test_a_tuple_without_radii_is_an_error():
     keep = torch.ones(7, dtype=torch.bool)
-    with pytest.raises(ValueError, match=r"expected an integer tensor of shape \(7,\)"):
+    with pytest.raises(ValueError, match=r"integer .*shape \(7,\)"):
         hide_dropped((torch.zeros(3, 4, 5), torch.ones(7)), keep)
     with pytest.raises(TypeError, match="returned Tensor"):
         hide_dropped(torch.zeros(3, 4, 5), keep)

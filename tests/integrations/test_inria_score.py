@@ -111,7 +111,7 @@ def test_what_cannot_be_scored_is_said():
     with pytest.raises(RuntimeError, match="0 times, expected once"):
         other(opacity, model.camera)
     fn = render_fn(make_render(rasterizer), model, PIPE, BACKGROUND, rasterizer=rasterizer)
-    with pytest.raises(ValueError, match="rasterizes 60 Gaussians, but 59 opacities"):
+    with pytest.raises(ValueError, match=r"60 Gaussians, .*59 opacities"):
         fn(opacity[1:], model.camera)
 
 
@@ -130,5 +130,5 @@ def test_an_alpha_is_not_measured_where_colors_cannot_be_given():
         return {"render": Rasterizer(settings)(gaussians.get_xyz, None, gaussians.get_opacity, torch.rand(60, 3))[0]}
 
     fn = render_fn(render, model, PIPE, BACKGROUND, rasterizer=Rasterizer)
-    with pytest.raises(ValueError, match=r"Rasterizer takes no colors_precomp.* return it from render, named alpha"):
+    with pytest.raises(ValueError, match=r"Rasterizer .*colors_precomp.*named alpha"):
         fn(model.get_opacity.detach(), model.camera)

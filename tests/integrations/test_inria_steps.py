@@ -79,7 +79,7 @@ def test_computed_positions_of_nobodys_steps_are_noticed(rasterizer):
     optimizer = optimizer_of(model)
     with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer):
         train(model, render, optimizer, **computed_means(model))
-        with pytest.raises(RuntimeError, match="cannot tell the training steps apart"):
+        with pytest.raises(RuntimeError, match=r"tell .*steps apart"):
             train(model, render, optimizer, **computed_means(model))
 
 
@@ -124,7 +124,7 @@ def test_training_on_the_views_of_a_viewer_is_an_error_at_once(rasterizer, model
     optimizer, camera = optimizer_of(model), MiniCam(model.camera)
     with RasterizerHook(regularizer, rasterizer=rasterizer):
         model.update_learning_rate(1)
-        with pytest.raises(RuntimeError, match=r"its camera is a MiniCam.*viewer=None.*--viewer none"):
+        with pytest.raises(RuntimeError, match=r"MiniCam.*viewer=None.*--viewer none"):
             train(model, render, optimizer, camera)
     with RasterizerHook(regularizer, rasterizer=rasterizer, viewer=None) as hook:
         model.update_learning_rate(1)
@@ -159,7 +159,7 @@ def test_a_training_past_the_hook_is_ended_early(rasterizer, model_class, update
     hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, patience=3).install()
     message, made = follow(hook, step)
     assert made == 4
-    assert re.search(r"4 optimizer steps .* Hooked is .*GaussianRasterizer.*rasterizer=.*--patience", message)
+    assert re.search("4 optimizer steps .*GaussianRasterizer.*rasterizer=.*--patience", message)
 
 
 def test_steps_past_the_hook_among_others_are_counted(rasterizer, model_class):
@@ -173,7 +173,7 @@ def test_steps_past_the_hook_among_others_are_counted(rasterizer, model_class):
     hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, patience=4).install()
     message, made = follow(hook, step)
     assert made == 11
-    assert "5 training steps had no render" in message
+    assert "5 training steps" in message
     assert (hook.tally.regularized, hook.tally.lost) == (5, 5)
 
 
@@ -182,7 +182,7 @@ def test_a_step_is_an_integer_of_python_or_numpy(rasterizer):
         hook.step(np.int64(3))
         make_render(rasterizer)((model := Model()).camera, model, PIPE, BLACK)
         for step in (3.0, torch.tensor(3)):
-            with pytest.raises(TypeError, match="step must be an integer"):
+            with pytest.raises(TypeError, match=r"step .*integer"):
                 hook.step(step)
     assert hook.tally.first_step == 3
 
@@ -198,13 +198,13 @@ def test_said_steps_without_a_render_are_counted(rasterizer):
 
     message, made = follow(hook, step)
     assert (made, hook.tally.lost) == (6, 3)
-    assert "3 training steps had no render" in message
+    assert "3 training steps" in message
 
 
 def test_a_short_training_past_the_hook_is_an_error_at_its_end(rasterizer):
     model, other = Model(), make_render(make_rasterizer())
     hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer)
-    with pytest.raises(RuntimeError, match="The training was not regularized"), hook:
+    with pytest.raises(RuntimeError, match="not regularized"), hook:
         train(model, other, optimizer_of(model))
     with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, patience=0):
         train(model, other, optimizer_of(model))

@@ -266,7 +266,7 @@ module, name = '{ENTRY_POINT}'.split(':')\nprint(getattr(importlib.import_module
 
 
 def test_unknown_names_are_attribute_errors():
-    with pytest.raises(AttributeError, match="has no attribute 'splatfacto'"):
+    with pytest.raises(AttributeError, match="no attribute 'splatfacto'"):
         _ = nerfstudio.splatfacto
 
 

@@ -219,11 +219,11 @@ def test_what_no_render_has_is_refused_before_the_training(rasterizer):
             raise AssertionError
 
     for make in (lambda x: RasterizerHook(x, rasterizer=rasterizer), lambda x: regularized(rasterization, x)):
-        with pytest.raises(ValueError, match=r"Concrete learns drop_logits .* only the bundled trainer"):
+        with pytest.raises(ValueError, match=r"Concrete .*drop_logits .*bundled trainer"):
             make(Concrete())
-    with pytest.raises(ValueError, match=r"Misspelt needs width, which this rasterizer does not take"):
+    with pytest.raises(ValueError, match="Misspelt needs width"):
         RasterizerHook(Misspelt(), rasterizer=rasterizer).install()
-    with pytest.raises(ValueError, match=r"Move needs scales, which .* it takes self, means3D, means2D, opacities"):
+    with pytest.raises(ValueError, match=r"Move needs scales, .*means3D, means2D"):
         RasterizerHook(Move(), rasterizer=Minimal).install()
     with pytest.raises(ValueError, match=r"Misspelt needs width"):
         regularized(rasterization, Misspelt())
@@ -277,11 +277,11 @@ def test_what_a_call_of_gsplat_lacks_is_refused_by_name(splats):
     wrapped = regularized(rasterization, Move())
     colors = splats["colors"]
     for changes in ({"sh_degree": None, "colors": colors[:, 0]}, {"colors": colors.expand(2, -1, -1, -1)}):
-        with pytest.raises(ValueError, match=r"Move needs sh, .*colors without sh_degree or for each camera"):
+        with pytest.raises(ValueError, match=r"Move needs sh, .*sh_degree"):
             wrapped(**splats | changes)
 
     def with_covars(means, quats, scales, opacities, colors, viewmats, Ks, width, height, covars=None, **options):
         raise AssertionError
 
-    with pytest.raises(ValueError, match=r"Move needs scales, .*covars"):
+    with pytest.raises(ValueError, match=r"needs scales, .*covars"):
         regularized(with_covars, Move())(**splats | {"covars": torch.rand(40, 3, 3)})

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -36,7 +37,7 @@ def test_scripts_that_a_script_starts_are_hooked(repository, tmp_path):
     (repository / "both.py").write_text(textwrap.dedent(start))
     done = run("--dropout", 0.5, "--report", tmp_path / "report.json", "both.py", cwd=repository)
     assert done.returncode == 0, done.stderr
-    assert "render.py, a process that it started: 0 renders regularized; 1 renders scaled" in done.stderr
+    assert re.search(r"render\.py, .*: 0 renders regularized; 1 renders scaled", done.stderr)
     report = json.loads((tmp_path / "report.json").read_text())
     found = {child["script"]: child["renders"]["regularized"] for child in report["started"]}
     assert found == {"render.py": 0, "train.py": 2}
@@ -88,7 +89,7 @@ def test_a_process_that_trains_past_the_hook_fails_the_run(repository):
     (repository / "both.py").write_text(start)
     done = run("--dropout", 0.5, "--start", 9, "both.py", cwd=repository)
     assert done.returncode == 1
-    assert "ERROR: train.py: The training was not regularized" in done.stderr
+    assert re.search(r"ERROR: train\.py: .*not regularized", done.stderr)
 
 
 @pytest.mark.parametrize(
@@ -164,5 +165,5 @@ def test_old_names_of_libraries_are_there_for_scripts_that_a_script_starts(repos
     (repository / "both.py").write_text(start)
     done = run("--dropout", 0.5, "both.py", cwd=repository)
     assert done.returncode == 0, done.stderr
-    assert "train.py, a process that it started: 2 renders regularized" in done.stderr
+    assert re.search(r"train\.py, .*: 2 renders regularized", done.stderr)
     assert not {"int", "float"} & set(vars(np))

@@ -5,7 +5,7 @@ import shlex
 import pytest
 from pages import ROOT, blocks
 
-from ca_reg.integrations.run import _parse
+from ca_reg.integrations.run import parse_options
 
 PAGE = ROOT / "docs" / "integrations.md"
 COMMANDS = [
@@ -21,7 +21,7 @@ def test_the_launcher_takes_the_commands(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     script = next(word for word in command if word.endswith(".py") or word.startswith("ns-"))
     (tmp_path / script).touch()
-    options = _parse(command)
+    options = parse_options(command)
     assert options.script.name == script
     assert bool(options.hook) == bool({"--dropout", "--noise", "--regularizer"} & {*command})
     assert options.arguments == command[command.index(script) + 1 :]

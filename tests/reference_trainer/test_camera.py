@@ -73,13 +73,13 @@ def test_to_changes_the_pose_alone():
     [
         ({"world_to_camera": torch.eye(3)}, r"finite \(4, 4\)"),
         ({"world_to_camera": EYE * math.nan}, r"finite \(4, 4\)"),
-        ({"fx": 0.0}, "focal lengths must be positive"),
-        ({"fy": math.nan}, "focal lengths must be positive"),
-        ({"fx": math.inf}, "focal lengths must be positive, finite pixels, got fx=inf"),
-        ({"cx": math.inf}, "principal point must be finite, in pixels, got cx=inf"),
-        ({"cy": math.nan}, "principal point must be finite"),
-        ({"width": 0}, "image size must be positive"),
-        ({"height": -3}, "image size must be positive"),
+        ({"fx": 0.0}, "focal lengths .*positive"),
+        ({"fy": math.nan}, "focal lengths .*positive"),
+        ({"fx": math.inf}, "focal lengths .*positive, finite pixels, got fx=inf"),
+        ({"cx": math.inf}, "principal point .*finite, in pixels, got cx=inf"),
+        ({"cy": math.nan}, "principal point .*finite"),
+        ({"width": 0}, "image size .*positive"),
+        ({"height": -3}, "image size .*positive"),
     ],
 )
 def test_impossible_cameras(changes, message):

@@ -30,7 +30,7 @@ def test_the_deterministic_switch_reaches_the_device(card, tmp_path, monkeypatch
     monkeypatch.setattr("reference_trainer.render.torch.compositing._running", lambda x, product: x.cumsum(-1))
     with pytest.raises(SystemExit):
         main([*TRAIN.split(), "--deterministic", "--monitor-every", "0", "--out", str(tmp_path)])
-    assert "cumsum does not have a deterministic implementation" in capsys.readouterr().err
+    assert "cumsum does not" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("first", "then"), [("card", "cpu"), ("cpu", "card")])

@@ -41,7 +41,7 @@ def test_writing_nothing_is_an_error(tmp_path):
 def test_a_folder_is_no_file_to_write(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for folder in (tmp_path, "."):
-        with pytest.raises(IsADirectoryError, match="this is a folder: expected the name of a file"), replacing(folder):
+        with pytest.raises(IsADirectoryError, match="is a folder"), replacing(folder):
             pass
     assert not list(tmp_path.iterdir())
 
@@ -51,7 +51,7 @@ def test_a_full_disk_is_named_and_keeps_what_was_there(tmp_path, full_disk):
     file.write_text("old")
     with (
         full_disk(1000),
-        pytest.raises(OSError, match=r"\(not written; what was there before is kept\): '.*note\.txt'$") as caught,
+        pytest.raises(OSError, match=r"\(not written; .*kept\): '.*note\.txt'$") as caught,
         replacing(file) as place,
     ):
         place.write_bytes(bytes(1001))

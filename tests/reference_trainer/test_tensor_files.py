@@ -8,7 +8,7 @@ def test_what_holds_itself_is_refused(tmp_path):
     endless = []
     endless.append(endless)
     torch.save({"x": endless}, tmp_path / "endless.pt")
-    with pytest.raises(ValueError, match=r"endless\.pt is not a file of tensors \(.*holds one list at two places"):
+    with pytest.raises(ValueError, match=r"endless\.pt .*list at two places"):
         load_tensors(tmp_path / "endless.pt")
 
 

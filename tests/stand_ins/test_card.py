@@ -39,14 +39,14 @@ def test_views_share_their_numbers(card):
     ],
 )
 def test_devices_do_not_mix(card, mix):
-    with pytest.raises(RuntimeError, match="expected all tensors to be on the same device"):
+    with pytest.raises(RuntimeError, match="the same device"):
         mix(on(card, 2))
 
 
 def test_a_second_card_is_another_device(card):
     one, other = on(card, 3), on("card:1", 3)
     assert (other.device.index, (2 * other).device.index, other.new_tensor([1.0]).device.index) == (1, 1, 1)
-    with pytest.raises(RuntimeError, match=r"same device, found cards \[0, 1\]"):
+    with pytest.raises(RuntimeError, match=r"found cards \[0, 1\]"):
         one + other
     assert (one + other.to(card)).tolist() == [2, 2, 2]
 
@@ -120,9 +120,9 @@ def test_numpy_needs_the_processor(card):
 
 def test_generators_have_a_device(card):
     assert torch.rand(3, device=card, generator=torch.Generator(card).manual_seed(0)).device.type == "card"
-    with pytest.raises(RuntimeError, match="expected a 'card' generator but found 'cpu'"):
+    with pytest.raises(RuntimeError, match=r"'card' generator .*'cpu'"):
         torch.rand(3, device=card, generator=torch.Generator())
-    with pytest.raises(RuntimeError, match="expected a 'cpu' generator but found 'card'"):
+    with pytest.raises(RuntimeError, match=r"'cpu' generator .*'card'"):
         torch.rand(3, generator=torch.Generator(card))
 
 
@@ -163,7 +163,7 @@ def test_additions_come_in_any_order_unless_they_shall_repeat_themselves():
 )
 def test_what_cannot_repeat_itself_is_refused_where_that_is_asked_for(card, call):
     call(on(card, 3))
-    with deterministic(card), pytest.raises(RuntimeError, match="does not have a deterministic implementation"):
+    with deterministic(card), pytest.raises(RuntimeError, match="deterministic implementation"):
         call(on(card, 3))
 
 

@@ -44,7 +44,7 @@ def test_a_row_names_the_commit_of_this_checkout():
     if not (root / ".git").exists():
         pytest.skip("needs a checkout")
     head = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-    commit = cells_module._commit()
+    commit = cells_module.commit()
     assert commit is not None
     assert head.stdout.startswith(commit.removesuffix("-dirty"))
 
@@ -52,7 +52,7 @@ def test_a_row_names_the_commit_of_this_checkout():
 def test_every_training_is_declared_once_and_covers_its_claims():
     cells = declared(ALL)
     assert len({json.dumps([cell.scene, cell.setting, cell.seed], sort_keys=True) for cell in cells}) == len(cells)
-    assert len({cells_module._folder(ALL, cell) for cell in cells}) == len(cells)
+    assert len({cells_module.folder_of(ALL, cell) for cell in cells}) == len(cells)
     there = {(cell.scene, json.dumps(cell.setting, sort_keys=True), cell.seed): cell for cell in cells}
     for claim in CLAIMS.values():
         compared = [setting for check in claim.checks for setting in (check.a, check.b)]
@@ -103,11 +103,11 @@ def test_the_declared_scenes_start_without_their_test_views(data_root):
 
 
 def test_unknown_names_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="no claim 18; choose of 1, 2"):
+    with pytest.raises(ValueError, match=r"no claim 18; .*1, 2"):
         chosen(["1", "18"])
-    with pytest.raises(ValueError, match="no declared scene garden; choose of synthetic, fern"):
+    with pytest.raises(ValueError, match=r"scene garden; .*fern"):
         chosen_scenes(["garden"], tmp_path, SceneOptions(""))
-    with pytest.raises(ValueError, match="declared scenes or --path, not both"):
+    with pytest.raises(ValueError, match="--path, not both"):
         chosen_scenes(["fern"], tmp_path, SceneOptions("mine"))
 
 

@@ -71,7 +71,7 @@ def test_what_is_kept_of_other_photographs_is_not_taken_for_these(tmp_path):
     rows_of(grid(downscale=4.0))["synthetic"].add(row(20.0))
     assert len(rows_of(grid(downscale=4.0))["synthetic"].rows) == 1
     for other in ({}, {"downscale": 2.0}):
-        with pytest.raises(ValueError, match=r"holds trainings with the options {'downscale': 4.0}, not .*--out"):
+        with pytest.raises(ValueError, match=r"options {'downscale': 4\.0}, not .*--out"):
             rows_of(grid(**other))
 
 
@@ -190,7 +190,7 @@ def figures(monkeypatch):
 
 def test_the_figure_plots_means_of_differences_where_three_places_are_kept(store, figures):
     gained = [0.5, 0.4, 0.9]
-    with pytest.raises(ValueError, match="no line to plot"):
+    with pytest.raises(ValueError, match="no line"):
         gains_figure(store, store.folder / "gains.png")
     rows = Rows(store.folder / "a.json")
     for seed, plain in enumerate((20.0, 20.2, 19.9)):
@@ -206,7 +206,7 @@ def test_the_figure_plots_means_of_differences_where_three_places_are_kept(store
 
 
 def test_the_ranking_plots_the_best_setting_first_and_the_score_beside_it(store, figures):
-    with pytest.raises(ValueError, match="claim 11: nothing to rank"):
+    with pytest.raises(ValueError, match="claim 11: nothing"):
         ranking_figure(store, ["7", "11"], store.folder / "ranking.png")
     rows = Rows(store.folder / "a.json")
     for seed, of in rows.of(resolved({}, "3dgs", 3_000)).items():

@@ -110,7 +110,7 @@ def test_the_mean_rate_where_depth_and_density_are_unrelated():
 
 @pytest.mark.parametrize("kind", [D2GSDropout, DepthDropout])
 def test_a_rate_out_of_range_is_refused_at_once(kind):
-    with pytest.raises(ValueError, match=r"rate must be in \[0, 1\), got 30"):
+    with pytest.raises(ValueError, match=r"rate .*\[0, 1\), got 30"):
         kind(30.0)
 
 

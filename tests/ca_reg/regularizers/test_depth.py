@@ -27,7 +27,7 @@ def test_test_time_is_the_model_itself():
 
 
 def test_negative_factors_are_refused():
-    with pytest.raises(ValueError, match="far must be finite and at least 0"):
+    with pytest.raises(ValueError, match=r"far .*at least 0"):
         DepthDropout(far=-0.1)
 
 

@@ -51,7 +51,7 @@ def test_gradients_reach_what_is_shown_only():
 
 
 def test_what_is_refused():
-    with pytest.raises(ValueError, match=r"p must be in \[0, 1\)"):
+    with pytest.raises(ValueError, match=r"\bp .*\[0, 1\)"):
         SHDropout(1.0)
     with pytest.raises(ValueError, match="in rising order"):
         SHDropout(until=(4_000, 2_000))

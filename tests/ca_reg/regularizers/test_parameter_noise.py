@@ -84,9 +84,9 @@ def test_nothing_is_drawn_without_noise_or_in_evaluation(kind, field, shape):
 
 @pytest.mark.parametrize(("kind", "field", "shape"), KINDS)
 def test_bad_input_is_refused(kind, field, shape):
-    with pytest.raises(ValueError, match="sigma must be finite and at least 0"):
+    with pytest.raises(ValueError, match=r"sigma .*at least 0"):
         kind(-0.1)
-    with pytest.raises(ValueError, match=f"needs {field} of the Gaussians"):
+    with pytest.raises(ValueError, match=f"needs {field}"):
         kind()(torch.full((4,), 0.5))
     assert kind().alpha_factor(params(4)) is None
     assert not kind.drops

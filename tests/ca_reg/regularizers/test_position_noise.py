@@ -33,5 +33,5 @@ def test_gradients_pass_and_test_time_is_the_model_itself():
 def test_schedules_and_refusals():
     x = params(cloud("spread"), step=0)
     assert PositionNoise(LinearRamp(0.0, 0.5, 0, 100)).regularize(x) is x
-    with pytest.raises(ValueError, match="sigma must be finite and at least 0"):
+    with pytest.raises(ValueError, match=r"sigma .*at least 0"):
         PositionNoise(-0.1)

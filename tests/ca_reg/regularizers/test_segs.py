@@ -116,10 +116,10 @@ def test_what_dropout_has_dropped_stays_dropped():
 
 
 def test_bad_input_is_refused():
-    with pytest.raises(ValueError, match="stop must come after start"):
+    with pytest.raises(ValueError, match=r"stop .*after start"):
         SEGSNoise(start=9_500)
-    with pytest.raises(ValueError, match="both values must be above 0"):
+    with pytest.raises(ValueError, match=r"values .*above 0"):
         SEGSNoise(last=0.0)
-    with pytest.raises(ValueError, match="needs means, scales, quaternions"):
+    with pytest.raises(ValueError, match="means, scales, quaternions"):
         SEGSNoise()(torch.full((3,), 0.5))
     assert SEGSNoise().alpha_factor(params(3)) is None

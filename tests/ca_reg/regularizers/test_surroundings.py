@@ -160,7 +160,7 @@ def test_ranks_share_ties():
 
 
 def test_every_must_be_a_number_of_steps():
-    with pytest.raises(ValueError, match="every must be at least 1"):
+    with pytest.raises(ValueError, match=r"every .*at least 1"):
         Refreshed(0)
 
 

@@ -30,16 +30,19 @@ def trained(tmp_path_factory):
 @pytest.mark.parametrize("what", [[""], ["point_cloud.ply"], ["", "point_cloud_for_viewers.ply"]])
 def test_a_run_or_a_ply_is_shown_until_ctrl_c(what, trained, capsys, monkeypatch):
     pytest.importorskip("viser")
-    shown = []
+    shown, show = [], Viewer.show
 
-    def update(viewer):
-        for model in viewer._models.values():
-            shown.append(model.render(viewer._options, model.views[0].camera).image)
+    def shows(viewer, model, views, name):
+        show(viewer, model, views, name)
+        shown.append(model.test_rendering(next(view for of in views.values() for view in of)).image)
+
+    def ctrl_c(viewer):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Viewer, "update", update)
+    monkeypatch.setattr(Viewer, "show", shows)
+    monkeypatch.setattr(Viewer, "update", ctrl_c)
     main(["view", *(str(trained / name) for name in what), "--port", "0"])
-    assert re.search(r"The viewer is at http://127\.0\.0\.1:\d+, .*; Ctrl-C ends it\.", capsys.readouterr().out)
+    assert re.search(r"http://127\.0\.0\.1:\d+, .*Ctrl-C", capsys.readouterr().out)
     assert [bool(image.std() > 0) for image in shown] == [True] * len(what)
     assert "1 model to show, or 2" in refused(["view", str(trained), str(trained)], capsys)
 
@@ -53,7 +56,7 @@ def test_the_scene_of_a_training_may_be_given_either_way(arguments, monkeypatch,
     (tmp_path / "garden").mkdir()
     main(["train", *arguments, "--views", "5", "--out", "out"])
     assert asked == [SceneOptions("garden", views=5)]
-    assert "not both: got garden and fern" in refused(["train", "garden", "--path", "fern"], capsys)
+    assert "got garden and fern" in refused(["train", "garden", "--path", "fern"], capsys)
 
 
 def test_the_commands_that_a_training_ends_with_can_be_pasted(monkeypatch, capsys, tmp_path):
@@ -150,10 +153,10 @@ def test_an_orbit_and_a_baked_ply(trained, capsys, tmp_path):
     small = ["--cameras", "1", "--size", "24", "--samples", "2"]
     main(["bake", str(trained / "point_cloud.ply"), "--out", str(tmp_path / "baked.ply")])
     said = plain(capsys.readouterr().out)
-    assert "baked.ply: opacities are those of the test after dropout(0.2), and marked so" in said
+    assert re.search(r"baked\.ply: .*after dropout\(0\.2\)", said)
     main(["evaluate", str(tmp_path / "baked.ply"), *small])
     out = capsys.readouterr().out
-    assert "0.8 baked in, taken out for CA; trained with: dropout(0.2)" in out
+    assert re.search(r"0\.8 baked in, .*trained with: dropout\(0\.2\)", out)
     assert "| mean orbit |" in out
     ply = str(trained / "point_cloud.ply")
     main(["evaluate", ply, "--out", str(tmp_path / "p"), *small])
@@ -203,7 +206,7 @@ def test_the_recipe_of_binocular_decays_opacities(monkeypatch, tmp_path):
 
 def test_other_settings_in_the_same_folder(trained, capsys):
     text = refused(["train", "--out", str(trained), "--dropout", "0.3", *SMALL], capsys)
-    assert "holds a run with other settings (dropout: 0.2 -> 0.3)" in text
+    assert "other settings (dropout: 0.2 -> 0.3)" in text
 
 
 def test_what_would_be_lost_is_refused(trained, capsys, tmp_path):
@@ -211,7 +214,7 @@ def test_what_would_be_lost_is_refused(trained, capsys, tmp_path):
     (tmp_path / "plan.json").write_text("precious")
     (tmp_path / "test_0.png").write_text("a photograph")
     garden = str(tmp_path)
-    assert "is the folder of the scene" in refused(["train", garden, "--out", garden], capsys)
+    assert "folder of the scene" in refused(["train", garden, "--out", garden], capsys)
     assert "is no plan of ca-reg" in refused(["plan", "--out", str(tmp_path / "plan.json")], capsys)
     assert "holds test_0.png" in refused(["render", str(trained), "--what", "test", "--out", garden], capsys)
     assert (tmp_path / "test_0.png").read_text() == "a photograph"
@@ -235,7 +238,7 @@ def test_nothing_is_written_to_the_photographs_or_over_other_files(trained, caps
         ["evaluate", str(run)], ["render", str(run)], ["evaluate", ply, "--scene", str(garden)],
         ["compare", str(garden), "--iterations", "1", "--seeds", "1"],
     ):  # fmt: skip
-        assert "is the folder of the scene" in refused([*command, "--out", str(garden)], capsys)
+        assert "folder of the scene" in refused([*command, "--out", str(garden)], capsys)
     (other / "evaluation.md").write_text("precious")
     assert "holds evaluation.md" in refused(["evaluate", str(trained), "--out", str(other)], capsys)
     (other / "dynamics.png").write_text("precious")
@@ -251,7 +254,7 @@ def test_without_test_views_the_training_views_are_rendered(capsys, tmp_path):
     main(["render", str(out)])
     assert "--what flight" in capsys.readouterr().out
     assert len(list((out / "render_train").glob("*.png"))) == 3
-    assert "no test view: give --what train" in refused(["render", str(out), "--what", "test"], capsys)
+    assert "test view: give --what train" in refused(["render", str(out), "--what", "test"], capsys)
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ def test_values_and_gradients_are_kornias(padding):
 
 
 def test_another_padding_is_refused():
-    with pytest.raises(ValueError, match="padding must be 'same' or 'valid', got 'reflect'"):
+    with pytest.raises(ValueError, match=r"padding .*'valid', got 'reflect'"):
         fused_ssim(torch.rand(1, 3, 16, 16), torch.rand(1, 3, 16, 16), padding="reflect")
 
 

@@ -82,7 +82,7 @@ def test_everything_is_replaced_everywhere_and_restored():
 
 def test_what_needs_cuda_says_so_by_its_name():
     with stand_in():
-        with pytest.raises(RuntimeError, match=r"gsplat\.rasterization_2dgs .* needs CUDA .* the MCMC strategy"):
+        with pytest.raises(RuntimeError, match=r"gsplat\.rasterization_2dgs .*CUDA .*MCMC"):
             gsplat.rasterization_2dgs()
         with pytest.raises(RuntimeError, match=r"gsplat\.\w+_fwd .* needs CUDA"):
             gsplat.spherical_harmonics(0, torch.ones(1, 3), torch.ones(1, 1, 3))
@@ -90,7 +90,7 @@ def test_what_needs_cuda_says_so_by_its_name():
 
 def test_without_gsplat_its_name_is_in_the_message(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(ImportError, match="this needs gsplat: pip install"), stand_in():
+    with pytest.raises(ImportError, match="gsplat: pip install"), stand_in():
         pass
 
 
@@ -115,5 +115,5 @@ def test_an_old_gsplat_is_told_from_a_missing_one(monkeypatch):
     old = ModuleType("gsplat")
     old.__version__ = "0.1.12"
     monkeypatch.setitem(sys.modules, "gsplat", old)
-    with pytest.raises(ImportError, match=r"gsplat 0\.1\.12 is too old.*gsplat>=1\.4"), stand_in():
+    with pytest.raises(ImportError, match=r"0\.1\.12 is too old.*gsplat>=1\.4"), stand_in():
         pass

@@ -171,7 +171,7 @@ def test_a_second_one_within_the_first_is_refused(repository):
         import diff_gaussian_rasterization as module
 
         assert module is sys.modules["diff_gaussian_rasterization"]
-        with pytest.raises(RuntimeError, match="or end an earlier one"), stand_in(repository):
+        with pytest.raises(RuntimeError, match="end an earlier"), stand_in(repository):
             pass
     assert not set(NAMES) & set(sys.modules)
 
@@ -208,6 +208,6 @@ def test_extensions_within_packages_and_unused_compiled_code(repository):
             (lambda: gaussian_renderer._C.rasterize(1), "diff_gaussian_rasterization._C.rasterize"),
             (lambda: gaussian_renderer.load("file"), "gaussian_tree._C.load"),
         ):
-            with pytest.raises(RuntimeError, match=f"{name} is compiled code.*without --cpu"):
+            with pytest.raises(RuntimeError, match=f"{name} .*compiled code.*--cpu"):
                 use()
     assert not {"gaussian_tree", "inner.simple_knn._C"} & set(sys.modules)

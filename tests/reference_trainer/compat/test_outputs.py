@@ -60,7 +60,7 @@ def test_every_kind_that_the_advice_lists_can_be_said():
 
 
 def test_what_nothing_tells_is_asked_for():
-    with pytest.raises(ValueError, match=r"does not unpack: say .* --outputs: .* image,radii,depth"):
+    with pytest.raises(ValueError, match=r"unpack: .*--outputs: .*image,radii,depth"):
         kinds_of(None, set())
 
 
@@ -97,7 +97,7 @@ def test_what_nothing_tells_is_asked_for():
 )
 def test_an_unknown_value_is_refused_once_it_is_used(use):
     held = {"kept": Unknown("counts")}["kept"]
-    with pytest.raises(ValueError, match=r"output counts is used, .* --outputs"):
+    with pytest.raises(ValueError, match=r"output counts .*--outputs"):
         use(held)
 
 

@@ -229,7 +229,7 @@ def test_antialiasing_keeps_its_digits_in_float32_where_splats_are_needles(setti
 
 def test_more_blur_than_the_renderers_is_refused(settings_of):
     scene = random_scene(4, 8, 8, seed=0)
-    with pytest.raises(ValueError, match=r"kernel_size, eps2d\) must be in \[0, 0.3\] .* got 0.5"):
+    with pytest.raises(ValueError, match=r"kernel_size, eps2d\) .*\[0, 0\.3\] .*got 0\.5"):
         _call(settings_of(scene.camera, kernel_size=0.5), scene)
 
 
@@ -283,7 +283,7 @@ def test_a_gradient_that_is_nan_where_nothing_is_rendered_does_no_harm(settings_
 
 def test_unknown_arguments_are_ignored_with_one_warning(settings_of):
     scene = random_scene(5, 8, 8, seed=3)
-    with pytest.warns(UserWarning, match="does not know the argument pose_of_the_test, and ignores it") as warned:
+    with pytest.warns(UserWarning, match="argument pose_of_the_test, .*ignores") as warned:
         images = [_call(settings_of(scene.camera), scene, pose_of_the_test=torch.eye(4))[0] for _ in range(2)]
     assert len(warned) == 1
     assert torch.equal(*images)
@@ -293,7 +293,7 @@ def test_unknown_arguments_are_ignored_with_one_warning(settings_of):
 def test_zeros_that_wait_for_a_gradient_of_every_gaussian_are_refused(settings_of):
     scene = random_scene(5, 8, 8, seed=3)
     sink = torch.zeros(5, 3, 3, requires_grad=True) + 0
-    with pytest.raises(ValueError, match=r"argument splits of the rasterizer, zeros of shape \(5, 3, 3\), waits for a"):
+    with pytest.raises(ValueError, match=r"argument splits .*\(5, 3, 3\)"):
         _call(settings_of(scene.camera), scene, splits=sink)
 
 
@@ -303,7 +303,7 @@ def test_a_package_has_the_names_that_are_asked_for_and_refuses_others():
     assert module.PlaneRasterizer is not module.GaussianRasterizer
     assert module.PlaneRasterizationSettings is module.GaussianRasterizationSettings
     assert not hasattr(module, "__file__")
-    with pytest.raises(ImportError, match="stand-in for my_rasterization has no SparseGaussianAdam"):
+    with pytest.raises(ImportError, match="my_rasterization has no SparseGaussianAdam"):
         module.SparseGaussianAdam  # noqa: B018
 
 

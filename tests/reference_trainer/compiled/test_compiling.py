@@ -2,8 +2,10 @@
 
 import importlib.util
 import json
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,23 +29,54 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
+def imported(path):
+    """Import a file anew, as in a new process."""
+    spec = importlib.util.spec_from_file_location(Path(path).stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 @pytest.fixture
-def loaded(tmp_path):
-    """Return a function that makes the kernel anew, as in a new process, uses it, and returns what was compiled."""
+def double(tmp_path):
+    """Return a function that makes the kernel anew and uses it."""
     path = tmp_path / "doubling.py"
     path.write_text(SOURCE)
 
-    def load() -> list[tuple[str, bool]]:
-        spec = importlib.util.spec_from_file_location("doubling", path)
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        compiled, x = [], np.arange(5.0)
-        with compiling.reported_to(lambda name, folder: compiled.append((name, folder is not None))):
-            compiling.kernel(module.double)(1, 4, x)
+    def use(compiling=compiling) -> None:
+        x = np.arange(5.0)
+        compiling.kernel(imported(path).double)(1, 4, x)
         assert x.tolist() == [0, 2, 4, 6, 4]
+
+    return use
+
+
+@pytest.fixture
+def loaded(double):
+    """Return a function that makes the kernel anew, uses it, and returns what was compiled."""
+
+    def load(compiling=compiling) -> list[tuple[str, bool]]:
+        compiled = []
+        with compiling.reported_to(lambda name, folder: compiled.append((name, folder is not None))):
+            double(compiling)
         return compiled
 
     return load
+
+
+@pytest.fixture
+def unwritable(tmp_path, monkeypatch):
+    """Return a function after which kernels cannot be kept anywhere."""
+
+    def make() -> None:
+        file = tmp_path / "file"
+        file.touch()  # nobody makes a folder below a file, not even root
+        (tmp_path / "__pycache__").touch()
+        monkeypatch.setattr(numba.config, "CACHE_DIR", str(file / "cache"))
+        for variable in ("HOME", "XDG_CACHE_HOME"):
+            monkeypatch.setenv(variable, str(file / "home"))
+
+    return make
 
 
 def test_it_is_compiled_once(folder, loaded):
@@ -61,26 +94,13 @@ def test_a_damaged_file_costs_the_time_to_compile(folder, loaded, suffix, damage
     assert loaded() == []  # and is mended
 
 
-def test_what_is_inlined_from_other_files_counts(folder, loaded, monkeypatch):
+@pytest.mark.parametrize("changed", ["constants.py", "tiles.py", "projection.py", "compositing.py", "threads.py", ""])
+def test_what_is_inlined_from_other_files_counts(folder, loaded, monkeypatch, changed):
     loaded()
-    monkeypatch.setattr(compiling, "_DIGEST", "of other sources")
-    assert loaded() == [("doubling.double", True)]
-
-
-def test_the_digest_is_of_what_is_inlined(monkeypatch):
-    read, texts = compiling.Path.read_bytes, {}
-
-    def edited(path):
-        texts[path.name] = read(path)
-        return texts[path.name] + (b"#" if path.name == changed else b"")
-
-    monkeypatch.setattr(compiling.Path, "read_bytes", edited)
-    changed = ""
-    assert compiling._digest() == compiling._DIGEST
-    for changed in ("constants.py", "tiles.py", "projection.py", "compositing.py"):  # noqa: B007
-        assert compiling._digest() != compiling._DIGEST
-    changed = "threads.py"
-    assert compiling._digest() == compiling._DIGEST
+    read = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + b"#" * (path.name == changed))
+    compiled = loaded(imported(compiling.__file__))
+    assert compiled == [("doubling.double", True)] * (changed not in ("threads.py", ""))
 
 
 def test_a_full_disk_costs_the_time_to_compile(folder, loaded, full_disk):
@@ -103,25 +123,21 @@ def test_it_is_kept_in_the_users_cache_and_not_among_the_installed_files(tmp_pat
     assert {path.relative_to(tmp_path).parts[:2] for path in tmp_path.rglob("*.nb?")} == {("home", "ca_reg")}
 
 
-def test_a_machine_on_which_nothing_can_be_written(tmp_path, folder, loaded, monkeypatch):
-    file = tmp_path / "file"
-    file.touch()  # nobody makes a folder below a file, not even root
-    (tmp_path / "__pycache__").touch()
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(file / "cache"))
-    for variable in ("HOME", "XDG_CACHE_HOME"):
-        monkeypatch.setenv(variable, str(file / "home"))
+def test_a_machine_on_which_nothing_can_be_written(folder, loaded, unwritable):
+    unwritable()
     assert loaded() == loaded() == [("doubling.double", False)]
 
 
-def test_it_says_so_once(caplog, monkeypatch, folder, loaded):
-    compiling._warn.cache_clear()
-    compiling._log("a", "/cache")
-    compiling._log("b", "/another cache")
-    assert [record.getMessage() for record in caplog.records] == [
-        "Compiling the renderer's loops, once on this machine: about 30 s of one core."
-    ]
-    compiling._log("a", None)
-    assert "in every process, as no folder can be written (set NUMBA_CACHE_DIR)" in caplog.text
+def test_it_says_so_once(caplog, folder, double, unwritable):
+    fresh = imported(compiling.__file__)
+    for _ in range(2):
+        double(fresh)
+        shutil.rmtree(folder)  # or the second time nothing would be compiled
+    (record,) = caplog.records
+    assert "once on this machine" in record.getMessage()
+    unwritable()
+    double(fresh)
+    assert "NUMBA_CACHE_DIR" in caplog.records[1].getMessage()
 
 
 SCRIPT = """

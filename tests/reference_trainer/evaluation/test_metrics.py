@@ -126,7 +126,7 @@ def test_inputs_may_carry_gradients():
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
 def test_wrong_images(metric):
-    with pytest.raises(ValueError, match=r"share one shape \(3, H, W\), got \(3, 4, 5\) and \(3, 5, 4\)"):
+    with pytest.raises(ValueError, match=r"shape .*got \(3, 4, 5\) and \(3, 5, 4\)"):
         metric(torch.zeros(3, 4, 5), torch.zeros(3, 5, 4))
     with pytest.raises(ValueError, match="share one shape"):
         metric(torch.zeros(1, 3, 4, 5), torch.zeros(1, 3, 4, 5))

@@ -35,7 +35,7 @@ def seen(scene):
 def test_a_bad_number_is_refused_by_name_and_place(scene, name, bad):
     tensor, at = getattr(scene, name).clone(), seen(scene)
     tensor.view(40, -1)[at, -1] = bad
-    with pytest.raises(NotFiniteError, match=f"{name} must be finite.* in 1 of 40 Gaussians, the first is number {at}"):
+    with pytest.raises(NotFiniteError, match=f"{name} .*finite.* 1 of 40 .*number {at}"):
         rendered(scene, **{name: tensor})
 
 
@@ -53,7 +53,7 @@ def test_harmonics_are_looked_at_as_far_as_they_are_used(scene):
     sh[seen(scene), 9, 0] = math.nan
     inputs = dict(zip(NAMES[:4], scene.tensors()[:4], strict=True))
     render(**inputs, camera=scene.camera, sh=sh, sh_degree=2)
-    with pytest.raises(NotFiniteError, match="sh must be finite"):
+    with pytest.raises(NotFiniteError, match=r"\bsh .*finite"):
         render(**inputs, camera=scene.camera, sh=sh)
 
 
@@ -66,12 +66,12 @@ def test_a_bad_camera_is_told_from_bad_gaussians(scene, name):
 
 def test_scales_whose_squares_overflow_are_refused(scene):
     huge = 1e21 if scene.means.dtype == torch.float32 else 1e160
-    with pytest.raises(NotFiniteError, match=r"their scales go up to [0-9.]+e\+(2|15)"):
+    with pytest.raises(NotFiniteError, match=r"scales .*up to [0-9.]+e\+(2|15)"):
         rendered(scene, scales=huge * scene.scales)
 
 
 def test_a_background_that_is_not_finite_is_refused(scene):
-    with pytest.raises(NotFiniteError, match=r"background must be finite, got .*nan"):
+    with pytest.raises(NotFiniteError, match=r"background .*finite, .*nan"):
         rendered(scene, background=torch.tensor([0.0, math.nan, 1.0], device=scene.means.device))
 
 
@@ -90,7 +90,7 @@ def test_a_background_that_is_changed_is_looked_at_again(scene):
     rendered(scene, background=background)
     background[1] = math.nan
     for opacities in (scene.opacities, torch.zeros_like(scene.opacities)):  # also where nothing is in view
-        with pytest.raises(NotFiniteError, match=r"background must be finite"):
+        with pytest.raises(NotFiniteError, match=r"background .*finite"):
             rendered(scene, background=background, opacities=opacities)
 
 
@@ -107,9 +107,7 @@ def test_geographic_coordinates_are_refused_in_float32_alone(case):
     pose[:3, 3] -= pose[:3, :3] @ shift
     moved = scene._replace(means=scene.means + shift, camera=replace(scene.camera, world_to_camera=pose))
     if case.dtype == torch.float32:
-        with pytest.raises(
-            ValueError, match=r"4.5e\+06 from the world's origin.* pixels of this view.*subtract a common"
-        ):
+        with pytest.raises(ValueError, match=r"4.5e\+06 .*origin.*subtract"):
             rendered(moved.to(case.dtype))
     else:
         torch.testing.assert_close(rendered(moved), rendered(scene), rtol=0, atol=1e-6)

@@ -95,18 +95,18 @@ def test_triton_without_a_c_compiler_is_as_good_as_none(afresh, monkeypatch):
 
 
 def test_an_engine_that_does_not_exist(monkeypatch):
-    with pytest.raises(ValueError, match="there is no engine 'metal'; choose one of auto, torch, numba"):
+    with pytest.raises(ValueError, match=r"no engine 'metal'; .*torch, numba"):
         use_engine("metal")
     monkeypatch.setenv("CA_REG_ENGINE", "metal")
-    with pytest.raises(ValueError, match="CA_REG_ENGINE names the engine 'metal'"):
+    with pytest.raises(ValueError, match=r"CA_REG_ENGINE .*'metal'"):
         describe_engine("cpu")
 
 
 def test_the_old_name_of_an_engine_is_refused_with_the_new_one(monkeypatch):
-    with pytest.raises(ValueError, match="no engine 'loops'; it is called numba now"):
+    with pytest.raises(ValueError, match=r"no engine 'loops'; .*numba"):
         use_engine("loops")
     monkeypatch.setenv("CA_REG_ENGINE", "loops")
-    with pytest.raises(ValueError, match="CA_REG_ENGINE names the engine 'loops'; it is called numba now"):
+    with pytest.raises(ValueError, match=r"CA_REG_ENGINE .*'loops'; .*numba"):
         describe_engine("cpu")
 
 

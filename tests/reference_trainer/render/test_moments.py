@@ -187,7 +187,7 @@ def test_a_background_of_another_size_is_refused(case):
 def test_a_background_that_is_not_finite_is_refused(background, case):
     scene = random_scene(5, 19, 13, seed=7).to(case.dtype)
     splats = splat(*scene[:4], scene.camera, colors=scene.colors)
-    with pytest.raises(ValueError, match=r"background must be finite, got nan or infinity in \d+ of \d+ numbers"):
+    with pytest.raises(ValueError, match=r"background .*in \d+ of \d+ numbers"):
         render_moments(splats, Multiplier.dropout(0.5), background=background)
 
 

@@ -185,7 +185,7 @@ except SystemExit as exit_:
     )
     assert "Engine: torch" in out
     assert "exact CA" in out
-    assert "Nothing is left to compile." in out
+    assert "Nothing is left" in out
     assert out.endswith("code 2\n")
 
 
@@ -224,9 +224,9 @@ except ImportError as error:
 """,
         PYTHONPATH=f"{tmp_path}:{PYTHONPATH}",
     )
-    assert out.startswith("torch torch ['numba is installed but cannot be used (Numba needs NumPy 1.0 or less): ")
-    assert out.count("numba is installed") == 1
-    assert "the engine numba needs numba" in out
+    assert out.startswith("torch torch ['")
+    assert out.count("(Numba needs NumPy 1.0 or less)") == 1
+    assert "engine numba needs numba" in out
 
 
 def test_warmup_leaves_nothing_to_compile(tmp_path):
@@ -247,8 +247,8 @@ print(*{str(kernel._cache.cache_path) for kernel in KERNELS}, sep="\\n")
             pytest.skip("no folder keeps loops")
         shutil.copytree(folder, tmp_path / folder.name, ignore=shutil.ignore_patterns("binning.*"))
     first, second = (run(script, timeout=900, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2))
-    assert "Compiling the renderer's loops, once on this machine" in first
+    assert "Compiling the renderer's loops" in first
     compiled = re.search(r"^Compiled: (.+)\.$", first, re.MULTILINE)[1].split(", ")
     assert {name.partition(".")[0] for name in compiled} == {"binning"}
     assert "Compiling" not in second
-    assert "Nothing is left to compile." in second
+    assert "Nothing is left" in second

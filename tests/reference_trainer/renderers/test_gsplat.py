@@ -133,9 +133,7 @@ def test_absolute_gradients_without_a_background_are_those_over_black():
 
 
 def test_what_is_missing_is_told(monkeypatch):
-    with pytest.raises(
-        RuntimeError, match=r"the device is 'cpu': train with --device cuda, or with --renderer builtin"
-    ):
+    with pytest.raises(RuntimeError, match=r"'cpu': .*--device cuda, .*--renderer builtin"):
         load_gsplat_render("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(RuntimeError, match="torch finds none"):

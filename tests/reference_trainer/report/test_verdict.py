@@ -1,4 +1,5 @@
 import math
+import re
 
 import pytest
 
@@ -53,17 +54,19 @@ def test_no_two_runs_share_a_name(changes, names):
 
 def test_one_seed_is_said_to_have_no_spread():
     found, evidence = verdict([rows("Baseline", [20.0], [0.004], baseline=True), rows("Mine", [20.55], [0.001])])
-    assert found == "Mine: 0.55 dB higher PSNR and 75 % less co-adaptation than the baseline on the 2 test views."
+    assert found.startswith("Mine: 0.55 dB higher PSNR")
+    assert "75 % less co-adaptation than the baseline" in found
+    assert "2 test views" in found
     (rule,) = evidence
-    assert rule.startswith("One seed: no spread is known")
+    assert "no spread" in rule
 
 
 @pytest.mark.parametrize("ca", [0.004, 0.0])
 def test_equal_scores_are_called_the_same(ca):
     found, _ = verdict([rows("A", [20.0], [ca]), rows("B", [20.0], [ca])])
-    assert found == "B: the same PSNR and the same co-adaptation as A on the 2 test views."
+    assert re.match("B: .*same PSNR .*same co-adaptation as A", found)
     mixed, _ = verdict([rows("A", [20.0], [ca]), rows("B", [20.1], [ca])])
-    assert mixed == "B: 0.10 dB higher PSNR and the same co-adaptation as A on the 2 test views."
+    assert re.match(r"B: 0\.10 dB higher .*same co-adaptation", mixed)
 
 
 def test_what_is_within_two_standard_errors_is_not_told_apart():
@@ -74,42 +77,44 @@ def test_what_is_within_two_standard_errors_is_not_told_apart():
         assert (2 * half * math.sqrt(2) < 1) == apart
         found, evidence = verdict([rows("A", psnr[0], [0.004] * 2), rows("B", psnr[1], [0.001] * 2)])
         assert ("1.00 dB higher PSNR" in found) == apart
-        assert ("a PSNR that cannot be told apart (1.00 dB higher)" in found) != apart
+        assert ("(1.00 dB higher)" in found) != apart
         assert "75 % less co-adaptation than A" in found
-        assert evidence[0].startswith("2 seeds each. Two means are told apart")
+        assert evidence[0].startswith("2 seeds")
 
 
 def test_every_strategy_is_in_the_verdict_or_its_evidence():
     strategies = [rows("Baseline", [20], [0.004], baseline=True), rows("A", [19], [0.003]), rows("B", [21], [0.005])]
     found, evidence = verdict(strategies, ["iterations"])
-    assert found.startswith("B (the highest PSNR of 2): 1.00 dB higher PSNR and 25 % more co-adaptation than the base")
-    assert evidence[0] == "A: 1.00 dB lower PSNR and 25 % less co-adaptation."
+    assert re.match(r"B \(.*highest PSNR of 2\): 1\.00 dB higher .*25 % more .*baseline", found)
+    assert re.match(r"A: 1\.00 dB lower .*25 % less", evidence[0])
     assert "differ in iterations too" in evidence[-1]
 
 
 def test_without_test_views_nothing_is_said_about_quality():
     pair = [rows(name, [30.0], [ca], split="around") for name, ca in (("A", 0.004), ("B", 0.002))]
     found, evidence = verdict(pair)
-    assert found == "B: 50 % less co-adaptation than A around the training views."
-    assert "nothing is known about the quality" in evidence[-1]
-    assert verdict([]) == ("No verdict: no run has been trained to its end.", [])
-    assert "exact CA 4.00e-3 around the training views" in verdict(pair[:1])[0]
+    assert re.match("B: 50 % less .*A around", found)
+    assert "quality" in evidence[-1]
+    nothing, none = verdict([])
+    assert nothing.startswith("No verdict")
+    assert none == []
+    assert "exact CA 4.00e-3" in verdict(pair[:1])[0]
 
 
 def test_scores_on_different_test_views_are_said_to_be():
     one, two = rows("A", [20.0], [0.004]), rows("B", [21.0], [0.004])
     two.results[0]["views"].append({"split": "test", "name": "another"})
     found, evidence = verdict([one, two])
-    assert found == "B: 1.00 dB higher PSNR and the same co-adaptation as A each on its own test views."
-    assert evidence[-1].startswith("The runs were not tested on the same views")
+    assert re.match(r"B: 1\.00 dB higher .*own test views", found)
+    assert "not tested on the same" in evidence[-1]
 
 
 def test_what_has_no_score_is_not_the_best():
     strategies = [rows(name, [30.0], [ca], split="around") for name, ca in (("A", 4e-3), ("B", math.nan), ("C", 2e-3))]
     found, evidence = verdict(strategies)
-    assert found.startswith("C (the least co-adaptation of 2): 50 % less co-adaptation than A")
-    assert evidence[0] == "B: no score in common."
-    assert verdict(strategies[1:])[0] == "C: no score in common with B around the training views."
+    assert re.match(r"C \(.*least co-adaptation of 2\): 50 % less .*A", found)
+    assert evidence[0].startswith("B: no score")
+    assert re.match("C: no score .*B around", verdict(strategies[1:])[0])
 
 
 def test_the_best_and_the_better_are_marked_where_that_is_a_merit():

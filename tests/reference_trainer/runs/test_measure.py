@@ -68,7 +68,7 @@ def test_noise_alone_has_a_ply_for_viewers_too(options, tmp_path):
 
 
 def test_a_run_is_not_rendered_as_if_trained_with_nonsense(run):
-    with pytest.raises(ValueError, match="there is no regularizer 'noize'"):
+    with pytest.raises(ValueError, match="no regularizer 'noize'"):
         load_run_model(run[0], regularizer="noize(0.8)")
 
 

@@ -2,14 +2,16 @@
 
 import dataclasses
 import json
+import re
+from contextlib import contextmanager
 
 import pytest
 import torch
 from heard import hearing
 from PIL import Image
 
-from reference_trainer.evaluation import evaluate as evaluate_module
 from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.results import ResultStore
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import BAKED_PLY, PLY
@@ -38,6 +40,22 @@ def orbit(gaussians, tmp_path, name, **keywords):
     return result, said
 
 
+@contextmanager
+def interrupted(monkeypatch):
+    """A context in which Ctrl-C comes after the second view is measured, and before it is recorded."""
+    original, done = ResultStore.add, []
+
+    def add(store, name, record):
+        if done:
+            raise KeyboardInterrupt
+        done.append(name)
+        original(store, name, record)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ResultStore, "add", add)
+        yield
+
+
 def test_a_baked_ply_is_not_scaled_twice(run, options):
     """Three ways to the image of the test: baked and marked, plain with the rate, and the checkpoint."""
     out, _ = run
@@ -46,10 +64,10 @@ def test_a_baked_ply_is_not_scaled_twice(run, options):
     plain, _ = load_ply_model(out / PLY, background=scene.background, regularizer="dropout(0.2)")
     trained, _ = load_run_model(out)
     assert (facts.opacity_scale, facts.for_rendering) == (0.8, False)
-    assert "0.8 baked in, taken out for CA; trained with: dropout(0.2)" in str(facts)
+    assert re.search(r"0\.8 baked in, .*trained with: dropout\(0\.2\)", str(facts))
     assert baked.factor == plain.factor == trained.factor == 0.8
     torch.testing.assert_close(baked.gaussians.opacities, trained.gaussians.opacities, rtol=0, atol=2e-6)
-    with pytest.raises(ValueError, match=r"was scaled for dropout 0\.2, not for dropout\(0\.5\)"):
+    with pytest.raises(ValueError, match=r"dropout 0\.2, not .*dropout\(0\.5\)"):
         load_ply_model(out / BAKED_PLY, background=scene.background, regularizer="dropout(0.5)")
     for view in scene.test:
         images = [model.render(model.test_opacities, view)[0] for model in (baked, plain, trained)]
@@ -70,7 +88,7 @@ def test_a_ply_with_the_mean_of_the_noise_is_used_as_it_is(run, scaled, options,
     out, results = scaled
     scene = load_scene(options)
     model, facts = load_ply_model(out / BAKED_PLY, background=scene.background)
-    assert "those of the test, used as they are, for CA too" in str(facts)
+    assert "used as they are" in str(facts)
     trained = load_run_model(out)[0]
     torch.testing.assert_close(model.test_opacities, trained.test_opacities, rtol=0, atol=1e-6)
     assert model.ca_score().settings == trained.ca_score().settings
@@ -89,7 +107,8 @@ def test_the_bands_that_are_used(tmp_path, band, used):
     save_ply(gaussians, tmp_path / "a.ply", pad_to_degree=3)
     facts = load_ply_model(tmp_path / "a.ply", background=torch.zeros(3))[1]
     assert (facts.gaussians, facts.sh_degree, facts.sh_degree_used) == (4, 3, used)
-    assert f"SH degree 3 (bands above {used} are zero); opacities: plain" in str(facts)
+    assert f"SH degree 3 (bands above {used} " in str(facts)
+    assert "opacities: plain" in str(facts)
 
 
 def test_what_the_caller_says_comes_first(tmp_path):
@@ -99,7 +118,7 @@ def test_what_the_caller_says_comes_first(tmp_path):
     model, _ = load_ply_model(tmp_path / "a.ply", background=torch.zeros(3), regularizer="dropout(0.5)")
     assert model.dropout == 0.5
     save_ply(ball(), tmp_path / "b.ply", regularizer="dropout(1.5)")
-    with pytest.raises(ValueError, match=r"b\.ply says what it was trained with: .*p must be in .* Give --regularizer"):
+    with pytest.raises(ValueError, match=r"b\.ply .*: .*p must .*--regularizer"):
         load_ply_model(tmp_path / "b.ply", background=torch.zeros(3))
 
 
@@ -138,24 +157,15 @@ def test_what_is_written_for_an_orbit(tmp_path):
 @pytest.mark.parametrize("on", ["orbit", "scene"])
 def test_an_interrupted_measurement_continues_to_the_same_files(tmp_path, options, monkeypatch, on, said):
     save_ply(ball(), tmp_path / "ball.ply")
-    original, done = evaluate_module._measure, []
 
     def measure(out, **keywords):
         where = FEW if on == "orbit" else options
         score_ply(tmp_path / "ball.ply", where, out, samples=2, **keywords)
         return said
 
-    def stopped(*arguments):
-        if done:
-            raise KeyboardInterrupt
-        done.append(arguments)
-        return original(*arguments)
-
     measure(tmp_path / "whole")
-    monkeypatch.setattr(evaluate_module, "_measure", stopped)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted(monkeypatch), pytest.raises(KeyboardInterrupt):
         measure(tmp_path / "cut")
-    monkeypatch.setattr(evaluate_module, "_measure", original)
     assert not (tmp_path / "cut" / "evaluation.json").exists()
     (tmp_path / "cut" / "views" / ".001.png.1.part").touch()  # as kill -9 leaves it
     assert f"1 measured before, kept: {tmp_path}/cut/evaluation.partial.json" in measure(tmp_path / "cut")
@@ -167,21 +177,12 @@ def test_an_interrupted_measurement_continues_to_the_same_files(tmp_path, option
 
 
 def test_another_model_in_the_same_file_is_measured_anew(tmp_path, monkeypatch):
-    measure = evaluate_module._measure
-
-    def stopped(model, view, *arguments):
-        if view.name == "001":
-            raise KeyboardInterrupt
-        return measure(model, view, *arguments)
-
     expected, _ = orbit(ball(opacity=0.8), tmp_path, "model")
-    monkeypatch.setattr(evaluate_module, "_measure", stopped)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted(monkeypatch), pytest.raises(KeyboardInterrupt):
         orbit(ball(opacity=0.9), tmp_path, "model")
-    monkeypatch.undo()
     found, said = orbit(ball(opacity=0.8), tmp_path, "model")
     assert repr(found) == repr(expected)
-    assert "they belong to another model, scene, setting or machine: everything is measured anew" in said[1]
+    assert "another model, scene, setting or machine" in said[1]
 
 
 def test_a_baked_and_a_plain_ply_have_the_same_scores(tmp_path):
@@ -211,7 +212,7 @@ def test_the_background(tmp_path):
     white, _ = orbit(dark, tmp_path, "white", background="white")
     assert white.mean("orbit", "ca_neutral") == pytest.approx(black.mean("orbit", "ca_neutral"), rel=1e-4)
     assert white.mean("orbit", "ca_exact") != pytest.approx(black.mean("orbit", "ca_exact"), rel=0.05)
-    with pytest.raises(ValueError, match="one of black, white, got 'gray'"):
+    with pytest.raises(ValueError, match="black, white, got 'gray'"):
         orbit(ball(), tmp_path, "gray", background="gray")
 
 
@@ -219,14 +220,14 @@ def test_a_place_is_told_from_an_object(tmp_path):
     room = ball(n=200, radius=20.0)
     both = Gaussians(**{name: torch.cat([x, dict(room.named())[name]]) for name, x in ball(n=300).named()})
     said = orbit(ball(), tmp_path, "object")[1]
-    assert not any("a place and not an object" in line for line in said)
-    assert "for those of the scene's own views give the scene (--scene FOLDER)" in said[-1]  # of any model
+    assert not any("a place and" in line for line in said)
+    assert "(--scene FOLDER)" in said[-1]  # of any model
     said = orbit(both, tmp_path, "place")[1]
-    assert "a place and not an object" in said[1]
+    assert "a place and" in said[1]
     save_ply(both, tmp_path / "arc.ply")
     with hearing() as said:
         score_ply(tmp_path / "arc.ply", dataclasses.replace(FEW, arc=40.0), tmp_path / "arc")
-    assert not any("a place and not an object" in line for line in said)
+    assert not any("a place and" in line for line in said)
 
 
 def test_a_ply_on_its_scene(run, options, tmp_path, said):
@@ -235,15 +236,15 @@ def test_a_ply_on_its_scene(run, options, tmp_path, said):
     found = json.loads((tmp_path / "evaluation.json").read_text())
     assert found["views"] == results["views"]
     assert found["ply"]["regularizer"] == "dropout(0.2)"
-    assert f"Scores and pictures are in {tmp_path}" in said
-    assert "where nobody took a photograph" in said[-1]
+    assert any(line.endswith(f" in {tmp_path}") for line in said)
+    assert "nobody took a photograph" in said[-1]
 
 
 @pytest.mark.parametrize(("downscale", "noted"), [(8.0, False), (5.0, True)])
 def test_another_size_than_that_of_the_training_is_noted(downscale, noted, run, options, said):
     """A run of `ca-reg run --quick` is made of a tenth of a megapixel, and its photographs are larger."""
     load_for_views(run[0] / PLY, dataclasses.replace(options, downscale=downscale))
-    assert any("trained at 20x15, the size of its pictures in " in text for text in said) == noted
+    assert any("trained at 20x15" in text for text in said) == noted
     assert any("is measured at 32x24" in text for text in said) == noted
 
 
@@ -261,13 +262,13 @@ def test_a_model_that_fits_no_photograph(tmp_path, photographs, request):
         save_ply(gaussians, tmp_path / f"{name}.ply")
         with hearing() as heard[name]:
             score_ply(tmp_path / f"{name}.ply", options, tmp_path / name, samples=2)
-    assert "a picture of one color" in heard["wrong"][-1]
+    assert "of one color" in heard["wrong"][-1]
     assert not any("one color" in text for text in heard["right"])
 
 
 def test_a_ply_in_another_frame_is_refused_before_anything_is_written(tmp_path, options):
     save_ply(dataclasses.replace(ball(), means=ball().means + 1e4), tmp_path / "far.ply")
-    with pytest.raises(ValueError, match="the cameras of synthetic do not see"):
+    with pytest.raises(ValueError, match="cameras of synthetic"):
         score_ply(tmp_path / "far.ply", options)
     assert [path.name for path in tmp_path.iterdir()] == ["far.ply"]
 

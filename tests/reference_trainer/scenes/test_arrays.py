@@ -142,14 +142,14 @@ def test_few_of_many_points(scene):
     [
         ({"pose": to_camera(), "K": INTRINSICS}, r"needs poses, called extrinsic, .* it has \['K'\]"),
         ({"extrinsic": to_camera()}, r"needs poses, .* and intrinsics, called intrinsic, .* \['extrinsic'\]"),
-        ({"extrinsic": to_camera()[:2], "K": INTRINSICS}, "has 2 cameras for the 3 images"),
+        ({"extrinsic": to_camera()[:2], "K": INTRINSICS}, "2 cameras .*3 images"),
         ({"extrinsic": to_camera()[:, :2], "K": INTRINSICS}, r"got \(3, 2, 4\) and \(3, 3, 3\)"),
-        ({"extrinsic": 2 * to_camera(), "K": INTRINSICS}, "camera of a.png: its pose holds no rotation"),
-        ({"extrinsic": to_camera(), "K": 0 * INTRINSICS}, "camera of a.png: focal lengths must be positive"),
+        ({"extrinsic": 2 * to_camera(), "K": INTRINSICS}, "camera of a.png: .*no rotation"),
+        ({"extrinsic": to_camera(), "K": 0 * INTRINSICS}, "camera of a.png: focal lengths .*positive"),
         ({"extrinsic": to_camera(), "K": INTRINSICS, "points": np.ones((4, 2))}, r"\(\.\.\., 3\), got \(4, 2\)"),
         ({"extrinsic": to_camera(), "K": INTRINSICS, "depth": np.ones((2, 6, 8))}, r"got \(2, 6, 8\) for 3 cameras"),
         ({"extrinsic": np.array(["a"]), "K": INTRINSICS}, "needs poses"),
-        ({"extrinsic": np.array([None]), "K": INTRINSICS}, "must hold numbers or text"),
+        ({"extrinsic": np.array([None]), "K": INTRINSICS}, "numbers or text"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said(scene, arrays, message):
@@ -160,5 +160,5 @@ def test_what_is_wrong_is_said(scene, arrays, message):
 def test_two_files(scene):
     root = scene(extrinsic=to_camera(), intrinsic=INTRINSICS)
     np.savez(root / "other.npz", a=np.ones(1))
-    with pytest.raises(ValueError, match=r"must hold one \.npz with the poses, got \['other.npz', 'predictions.npz'\]"):
+    with pytest.raises(ValueError, match=r"one \.npz .*\['other\.npz', 'predictions\.npz'\]"):
         load_scene(SceneOptions(root))

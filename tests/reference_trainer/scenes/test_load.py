@@ -35,7 +35,7 @@ def photo_scene(tmp_path, colmap_text, save_image):
 
 def test_colmap_scene(photo_scene):
     scene = load_scene(SceneOptions(photo_scene, points="sparse/0", undistort=False))
-    assert "is left in, as asked" in str(scene)
+    assert "is left in" in str(scene)
     assert scene.name == "garden"
     assert [view.name for view in scene.train] == ["b.png", "c.png"]
     assert [view.name for view in scene.test] == ["a b.png"]
@@ -78,7 +78,7 @@ def test_a_reconstruction_beside_its_usual_place(photo_scene, place, format):
 
 
 def test_a_folder_of_pictures_that_is_not_there(photo_scene):
-    with pytest.raises(FileNotFoundError, match=r"no folder .*images_8; .*with pictures are \['images', 'images_4'\]"):
+    with pytest.raises(FileNotFoundError, match=r"no folder .*images_8; .*\['images', 'images_4'\]"):
         load_scene(SceneOptions(photo_scene, images="images_8"))
 
 
@@ -89,9 +89,9 @@ def test_a_scene_says_what_a_user_checks_first(photo_scene, blender_scene):
         "1 test view: a b.png",
     ]
     scene = load_scene(SceneOptions(blender_scene))
-    assert str(scene).startswith(
-        f"photographs: {blender_scene / 'test'}, {blender_scene / 'train'}, used at 8x6 pixels"
-    )
+    about = str(scene).splitlines()[0]
+    assert f"{blender_scene / 'test'}, {blender_scene / 'train'}" in about
+    assert "8x6 pixels" in about
     many = dataclasses.replace(scene, train=scene.train * 5, test=())
     assert str(many).splitlines()[1:3] == [f"15 training views: {'train/r_0, train/r_1, train/r_2, ' * 3}train/r_0, "
                                           "train/r_1, ..., train/r_2", "0 test views"]  # fmt: skip
@@ -99,7 +99,7 @@ def test_a_scene_says_what_a_user_checks_first(photo_scene, blender_scene):
 
 def test_points_that_saw_test_views_are_refused(photo_scene):
     (photo_scene / "split.json").write_text(json.dumps({"train": ["a b.png", "b.png"], "test": ["c.png"]}))
-    with pytest.raises(ValueError, match=r"seen 1 image outside the training split: c\.png"):
+    with pytest.raises(ValueError, match=r"1 image .*: c\.png"):
         load_scene(SceneOptions(photo_scene, points="sparse/0"))
     assert load_scene(SceneOptions(photo_scene, points="sparse/0", allow_test_points=True)).points.seen_by == {
         "b.png",
@@ -195,14 +195,14 @@ def test_detect_format(photo_scene, blender_scene, tmp_path):
         ({"format": "nerf"}, "format must be"),
         ({"background": "green"}, "background must be"),
         ({"downscale": 0.5}, "downscale must be"),
-        ({"downscale": math.nan}, "downscale must be a finite number of at least 1, got nan"),
+        ({"downscale": math.nan}, "downscale .*finite number of at least 1, got nan"),
         ({"views": 0}, "views must be"),
-        ({"views": 5}, "no training set of 5 views"),
+        ({"views": 5}, "set of 5 views"),
         ({"split": "other"}, r"no split 'other'; choose auto, llff, dtu or a JSON file of the scene: \['split'\]"),
         ({"images": "pictures"}, "no folder"),
         ({"points": "sparse/1"}, r"choose auto, random, a \.ply or one of \['sparse/0'\]"),
         ({"points": "sparse"}, r"no COLMAP model in .*sparse; choose .* one of \['sparse/0'\]"),
-        ({"points": "../sparse/0"}, "leads out of the scene"),
+        ({"points": "../sparse/0"}, "leads out"),
         ({"points": "random:many"}, "random:<count>"),
         ({"points": "cloud.ply"}, "no point cloud"),
     ],
@@ -222,7 +222,7 @@ def test_options_without_use_are_refused(blender_scene):
 def test_pictures_of_another_shape_are_refused(photo_scene, save_image):
     for name in ("a b", "b", "c"):
         save_image(photo_scene / "images_3" / f"{name}.png", np.zeros((40, 40, 3), np.uint8))
-    with pytest.raises(ValueError, match="40x40 but its camera is for 64x48"):
+    with pytest.raises(ValueError, match=r"40x40 .*64x48"):
         load_scene(SceneOptions(photo_scene, images="images_3", points="sparse/0"))
 
 
@@ -233,7 +233,7 @@ def test_photographs_that_cannot_be_read_are_named(photo_scene):
     cut = photo_scene / "images" / "b.png"
     Image.open(cut).save(cut, "JPEG")
     cut.write_bytes(cut.read_bytes()[:-200])
-    with pytest.raises(ValueError, match=r"b\.png is not a readable image"):
+    with pytest.raises(ValueError, match=r"b\.png .*readable"):
         load_scene(SceneOptions(photo_scene, points="random:5"))
 
 
@@ -246,7 +246,7 @@ def test_fern(data_root):
     assert scene.train[0].image.shape == (3, camera.height, camera.width) == (3, 189, 252)
     assert scene.points.source.endswith("sparse_3views_dense/0")
     assert len(scene.points.positions) == 15_000
-    with pytest.raises(ValueError, match="outside the training split"):
+    with pytest.raises(ValueError, match="the training split"):
         load_scene(SceneOptions(data_root / "fern", images="images_16", points="sparse/0"))
     by_rule = load_scene(SceneOptions(data_root / "fern", images="images_16", split="llff", format="llff"))
     assert [view.name for view in by_rule.train] == [view.name for view in scene.train]
@@ -284,7 +284,7 @@ def test_a_scene_goes_through_plan_without_a_word_of_explanation(data_root, name
     else:
         assert len(scene.test) == 8
         assert all(0.01 < float(mask.mean()) < 0.9 for mask in masks)
-        assert any("scores count what is white" in note for note in scene.notes)
+        assert any("what is white" in note for note in scene.notes)
 
 
 @pytest.fixture
@@ -312,7 +312,7 @@ def test_the_honest_points_of_a_scene_are_honest_in_every_format(cape):
     assert [view.name for view in scene.train] == ["images/5923", "images/5929", "images/5934"]
     assert scene.points.source.endswith("sparse_3views_dense/0")
     assert len(scene.points.positions) == 10_000
-    with pytest.raises(ValueError, match="outside the training split"):
+    with pytest.raises(ValueError, match="the training split"):
         load_scene(SceneOptions(cape, format="transforms", points="sparse/0"))
 
 

@@ -23,7 +23,7 @@ def cloud(seen_by):
 
 
 def test_leak_is_refused_by_name_with_the_way_out():
-    with pytest.raises(ValueError, match=r"sparse/0 have seen 2 images .*: c, d\..*--allow-test-points"):
+    with pytest.raises(ValueError, match=r"sparse/0 .*2 images .*: c, d\..*--allow-test-points"):
         check_no_leak(cloud(frozenset("abcd")), ["a", "b"])
     with pytest.raises(ValueError, match="20 images"):
         check_no_leak(cloud(frozenset(map(str, range(20)))), [])
@@ -55,7 +55,7 @@ def test_one_photograph_has_a_name_in_every_format(train):
     ],
 )
 def test_another_photograph_is_not_taken_for_one_that_trains(seen, train, held_out):
-    with pytest.raises(ValueError, match="have seen 1 image outside the training split"):
+    with pytest.raises(ValueError, match="1 image outside"):
         check_no_leak(cloud(frozenset({seen})), train, held_out)
 
 
@@ -68,7 +68,7 @@ def test_colmap_points(tmp_path, colmap_binary):
     assert points.seen_by == {"b.png", "c.png"}
     (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 0))
     assert colmap_points(tmp_path) is None
-    with pytest.raises(ValueError, match="no points to start from"):
+    with pytest.raises(ValueError, match="no points"):
         choose_points(tmp_path, ".", [], [], torch.Generator())
 
 
@@ -121,7 +121,7 @@ def test_random_points_are_uniform_in_inverse_depth():
 
 def test_frusta_without_a_meeting_point_are_refused():
     parallel = [Camera(torch.eye(4), 60.0, 50.0, 35.0, 22.0, 64, 48)] * 2
-    with pytest.raises(ValueError, match=r"optical axes .*--points .*a COLMAP folder or a \.ply file"):
+    with pytest.raises(ValueError, match=r"optical axes .*--points .*COLMAP .*\.ply"):
         random_points(frames(parallel), 10, torch.Generator())
     apart = [looking([3.0, 0.0, 0.0], [6.0, 0.0, 1.0]), looking([-3.0, 0.0, 0.0], [-6.0, 0.0, 1.0])]
     with pytest.raises(ValueError, match="optical axes"):
@@ -146,7 +146,7 @@ def test_a_thin_cloud_gets_random_points_at_its_depths(generator):
     flat = torch.rand(999, 3, generator=generator) + torch.tensor([0.0, 0.0, 8.0])
     thin = PointCloud(flat, torch.rand(999, 3, generator=generator), "sparse/0", frozenset("ab"))
     more, note = filled(thin, frames(cameras), generator)
-    assert "10,000 random ones at their depths" in note
+    assert "10,000 random ones" in note
     assert torch.equal(more.positions[:999], flat)
     assert torch.equal(more.colors[:999], thin.colors)
     assert (more.source, more.seen_by, len(more.positions)) == ("sparse/0", frozenset("ab"), 10_999)

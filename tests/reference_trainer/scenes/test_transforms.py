@@ -89,18 +89,18 @@ def test_paths_may_have_been_written_on_windows(blender_scene):
         (lambda c: c.pop("frames"), "no entry 'frames'"),
         (lambda c: c.pop("camera_angle_x"), "no entry 'camera_angle_x'"),
         (lambda c: c.update(camera_angle_x=math.pi), "camera_angle_x must be"),
-        (lambda c: c.update(frames=3), "not a valid transforms file"),
-        (lambda c: c["frames"].append(5), "not a valid transforms file"),
+        (lambda c: c.update(frames=3), "valid transforms file"),
+        (lambda c: c["frames"].append(5), "valid transforms file"),
         (lambda c: c["frames"].append(c["frames"][0]), "lists an image twice"),
-        (lambda c: c["frames"][0].update(file_path="../../etc/x"), "leads out of the scene"),
-        (lambda c: c["frames"][0].update(file_path="..\\..\\etc\\x"), "leads out of the scene"),
-        (lambda c: c["frames"][0].update(file_path="/etc/x"), "leads out of the scene"),
-        (lambda c: c["frames"][0].update(mask_path="../mask.png"), "leads out of the scene"),
-        (lambda c: c["frames"][0].update(mask_path=3), "not a valid transforms file"),
+        (lambda c: c["frames"][0].update(file_path="../../etc/x"), "leads out"),
+        (lambda c: c["frames"][0].update(file_path="..\\..\\etc\\x"), "leads out"),
+        (lambda c: c["frames"][0].update(file_path="/etc/x"), "leads out"),
+        (lambda c: c["frames"][0].update(mask_path="../mask.png"), "leads out"),
+        (lambda c: c["frames"][0].update(mask_path=3), "valid transforms file"),
         (lambda c: c["frames"][0].update(transform_matrix=[[1, 0], [0, 1]]), "finite 4x4"),
         (lambda c: c["frames"][0].update(transform_matrix=np.diag([2, 2, 2, 1]).tolist()), "no rotation"),
         (lambda c: c["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "no rotation"),
-        (lambda c: c["frames"][0].update(transform_matrix="eye"), "not a valid transforms file"),
+        (lambda c: c["frames"][0].update(transform_matrix="eye"), "valid transforms file"),
     ],
 )
 def test_bad_files_are_refused_with_their_path(blender_scene, change, reason):
@@ -118,7 +118,7 @@ def test_missing_files(blender_scene):
     with pytest.raises(FileNotFoundError, match=r"r_1\.png"):
         read_transforms(blender_scene / "transforms_train.json")
     (blender_scene / "transforms_test.json").write_text("{")
-    with pytest.raises(ValueError, match="not a valid transforms file"):
+    with pytest.raises(ValueError, match="valid transforms file"):
         read_transforms(blender_scene / "transforms_test.json")
 
 

@@ -67,7 +67,7 @@ def test_no_more_is_cut_off_than_needed():
 
 
 def test_a_lens_that_folds_is_refused():
-    with pytest.raises(ValueError, match="folds the picture over itself"):
+    with pytest.raises(ValueError, match=r"folds .*itself"):
         undistort(torch.ones(1, 120, 160), CAMERA, (-9.0,))
 
 

@@ -185,14 +185,14 @@ def test_slope_and_extrapolation_of_a_known_power_law():
 
 @pytest.mark.parametrize("change", [{"max_samples": 8}, {"max_samples": 96}, {"seeds": 0}])
 def test_settings_out_of_range_are_refused(change, tmp_path):
-    with pytest.raises(ValueError, match="a power of two of at least 16, and at least 1 seed"):
+    with pytest.raises(ValueError, match=r"power of two .*16, .*1 seed"):
         error_runtime_study([tmp_path / "a.ply"], **change)
 
 
 def test_views_without_a_score_are_refused(scene):
     model, view = scene
     away = dataclasses.replace(view.camera, world_to_camera=torch.diag(torch.tensor([-1.0, 1, -1, 1])))
-    with pytest.raises(ValueError, match="no pixel of tiny has an expected alpha above"):
+    with pytest.raises(ValueError, match="no pixel of tiny"):
         error_runtime(model, dataclasses.replace(view, camera=away))
     black = dataclasses.replace(model.gaussians, sh_dc=torch.full((9, 1, 3), -9.0))
     with pytest.raises(ValueError, match="nothing varies"):
@@ -261,7 +261,7 @@ def test_a_ply_is_known_by_its_name(tmp_path):
 
 def test_sources_that_cannot_be_told_apart_or_are_scaled_are_refused(ball, tmp_path):
     for sources in ([ball, ball], [ball, tmp_path / "other" / "ball.ply"]):
-        with pytest.raises(ValueError, match="sources must have different names"):
+        with pytest.raises(ValueError, match="different names"):
             error_runtime_study(sources)
     gaussians = load_ply(ball).gaussians
     for keywords, by in (
@@ -283,8 +283,8 @@ def known(exact_error) -> dict:
     return made([*sampled, first, exact, (DOUBLE, None, [0.5], [2e-3], [0.0], [0.0])])
 
 
-def test_the_table_holds_medians_and_root_mean_squares():
-    text = module._report({"x": known(5e-4), "y": known(0.0)})
+def test_the_table_holds_medians_and_root_mean_squares(tmp_path):
+    text = error_runtime_study([tmp_path / "a.ply"]).report({"x": known(5e-4), "y": known(0.0)})
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()]
     assert cells[0] == ["## x"]
     assert cells[4] == ["Monte Carlo", "8", "0.8", "8", "2.10 ± 0.14", "1.2", "0.1"]  # rms of 3 and 4 over root 8
@@ -300,7 +300,8 @@ def test_the_table_holds_medians_and_root_mean_squares():
 @pytest.mark.slow
 def test_the_figure_can_be_plotted_without_an_error_of_the_exact_estimate(tmp_path):
     figure = Figure(layout="constrained")
-    module._plot({"a": known(5e-4), "b": known(0.0), "c": known(1e-6)}, figure)
+    study = error_runtime_study([tmp_path / "a.ply"])
+    study.plot({"a": known(5e-4), "b": known(0.0), "c": known(1e-6)}, figure)
     figure.savefig(tmp_path / "f.png")
     with Image.open(tmp_path / "f.png") as picture:
         assert picture.width > picture.height

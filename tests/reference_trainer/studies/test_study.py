@@ -104,7 +104,7 @@ def test_a_check_continues_where_it_was_interrupted_and_begins_anew_when_it_is_f
 
 def test_on_an_executor_a_failing_case_does_not_stop_the_others(tmp_path, said):
     cases = {"a": {"text": "x", "times": -1}, "b": {"text": "y"}}
-    with pytest.raises(RuntimeError, match=r"1 of 2 cases FAILED; the same .* again:\n  a: ValueError: no -1 times"):
+    with pytest.raises(RuntimeError, match=r"1 of 2 .*FAILED; .*:\n  a: ValueError: no -1"):
         run_study(study(**cases), tmp_path, executor=Here(1))
     assert said[:3] == ["[1/2] a: FAILED", "[2/2] b", "b: y\n"]
     assert json.loads((tmp_path / "letters.json").read_text())["failed"] == {"a": "ValueError: no -1 times"}
@@ -114,7 +114,7 @@ def test_on_an_executor_a_failing_case_does_not_stop_the_others(tmp_path, said):
 
 
 def test_no_case_is_no_study(tmp_path):
-    with pytest.raises(ValueError, match="at least 1 case of letters"):
+    with pytest.raises(ValueError, match="1 case of letters"):
         run_study(study(), tmp_path)
 
 
@@ -138,7 +138,7 @@ def test_checkpoints_are_named_by_the_last_parts_of_their_paths_that_tell_them_a
 def test_a_folder_where_another_study_is_at_work_is_left_alone(tmp_path):
     with run_lock(tmp_path):
         before = sorted(tmp_path.iterdir())
-        with pytest.raises(FolderInUseError, match="another process is at work there"):
+        with pytest.raises(FolderInUseError, match="at work there"):
             run_study(study(a={"text": "x"}), tmp_path)
         assert (measured, sorted(tmp_path.iterdir())) == ([], before)
     run_study(study(a={"text": "x"}), tmp_path)

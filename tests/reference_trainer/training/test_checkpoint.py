@@ -36,7 +36,7 @@ def test_a_disk_that_is_full_half_way_keeps_the_old_file(tmp_path, full_disk):
     old = path.read_bytes()
     with (
         full_disk(100_000),
-        pytest.raises(OSError, match=r"what was there before is kept.*checkpoint\.pt"),
+        pytest.raises(OSError, match=r"before is kept.*checkpoint\.pt"),
     ):
         save_checkpoint(path, {"x": torch.zeros(100_000)})
     gc.collect()  # Python 3.12.1 crashed here
@@ -45,7 +45,7 @@ def test_a_disk_that_is_full_half_way_keeps_the_old_file(tmp_path, full_disk):
 
 
 def test_a_missing_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"there is no checkpoint at .*nowhere\.pt"):
+    with pytest.raises(FileNotFoundError, match=r"no checkpoint at .*nowhere\.pt"):
         load_checkpoint(tmp_path / "nowhere.pt")
 
 
@@ -53,7 +53,7 @@ def test_a_missing_file(tmp_path):
 def test_garbage_is_refused_by_name(tmp_path, content):
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"checkpoint\.pt is not a readable checkpoint"):
+    with pytest.raises(ValueError, match=r"checkpoint\.pt .*readable checkpoint"):
         load_checkpoint(path)
 
 
@@ -63,7 +63,7 @@ def test_a_cut_file_is_refused_by_name(tmp_path):
     whole = path.read_bytes()
     for share in (0.1, 0.5, 0.9, 0.999):
         path.write_bytes(whole[: int(share * len(whole))])
-        with pytest.raises(ValueError, match=r"checkpoint\.pt is not a readable checkpoint"):
+        with pytest.raises(ValueError, match=r"checkpoint\.pt .*readable checkpoint"):
             load_checkpoint(path)
 
 
@@ -71,7 +71,7 @@ def test_a_cut_file_is_refused_by_name(tmp_path):
 def test_files_of_other_programs(tmp_path, content):
     path = tmp_path / "other.pt"
     torch.save(content, path)
-    with pytest.raises(ValueError, match=r"other\.pt is not a checkpoint of this program"):
+    with pytest.raises(ValueError, match=r"other\.pt .*this program"):
         load_checkpoint(path)
 
 
@@ -91,7 +91,7 @@ def test_nothing_in_a_file_is_executed(tmp_path, writer):
         torch.save(content, path)
     else:
         path.write_bytes(pickle.dumps(content))
-    with pytest.raises(ValueError, match=r"evil\.pt is not a readable checkpoint"):
+    with pytest.raises(ValueError, match=r"evil\.pt .*readable checkpoint"):
         load_checkpoint(path)
     assert not target.exists()
 
@@ -178,7 +178,7 @@ def test_a_model_that_is_not_finite_does_not_replace_one_that_is(tiny_scene, tmp
     trainer.train(until=2)
     with torch.no_grad():
         getattr(trainer.gaussians, name)[3] = math.nan
-    with pytest.raises(TrainingStoppedError, match="nan or infinite by step 2, which is not saved: lower the learning"):
+    with pytest.raises(TrainingStoppedError, match=r"nan .*step 2, .*not saved"):
         trainer.save(path)
     assert path.read_bytes() == before
 
@@ -224,11 +224,11 @@ def test_means_of_another_shape(saved, tiny_scene, tmp_path, shape):
 
 @pytest.mark.parametrize("scene", [torch.zeros(3), ["synthetic"], "x" * 100_000])
 def test_a_scene_of_another_kind_is_told_in_a_line(saved, tiny_scene, tmp_path, scene):
-    for key, said in (("scene", "was trained on the scene"), ("train_views", "was trained on the views")):
+    for key, said in (("scene", "on the scene"), ("train_views", "was trained on the views")):
         refused(saved, tiny_scene, tmp_path, lambda s, key=key: s.update({key: scene}), said)
     state = load_checkpoint(saved) | {"scene": scene}
     save_checkpoint(tmp_path / "checkpoint.pt", state)
-    with pytest.raises(ValueError, match="was trained on the scene") as error:
+    with pytest.raises(ValueError, match="on the scene") as error:
         Trainer.load(tmp_path / "checkpoint.pt", tiny_scene)
     assert len(str(error.value)) < 400
 

@@ -91,7 +91,7 @@ def test_impossible_values_are_named(field, value):
 )  # fmt: skip
 def test_counts_are_integers(field, value):
     """A training with another number had run, and its checkpoint was refused as damaged."""
-    with pytest.raises(TypeError, match=rf"{field} must be an integer, got {value!r}: convert it with int\(\)"):
+    with pytest.raises(TypeError, match=rf"{field} .*integer, got {value!r}: .*int\(\)"):
         TrainConfig(**{field: value})
 
 
@@ -101,7 +101,7 @@ def test_counts_are_integers(field, value):
 )
 def test_rates_are_numbers_that_a_checkpoint_can_hold(field, value):
     """JSON knows no other, and read True as no number."""
-    with pytest.raises(TypeError, match=rf"{field} must be a number of Python's, got .*: convert it with float\(\)"):
+    with pytest.raises(TypeError, match=rf"{field} .*number .*got .*: .*float\(\)"):
         TrainConfig(**{field: value})
 
 
@@ -117,10 +117,10 @@ def test_a_rate_of_numpy_is_written_like_one_of_python():
     ("settings", "message"),
     [
         ({"regularizer": "dropout"}, "missing 1 required positional argument"),
-        ({"loss": ""}, "loss needs at least one term"),
+        ({"loss": ""}, "at least one term"),
         ({"loss": "photometric(2.0)"}, "lambda_dssim must lie in"),
-        ({"loss": "co_adaptation(-1.0)"}, "weight must not be negative"),
-        ({"density": "adaptive + adaptive"}, "expected one density strategy, got 2"),
+        ({"loss": "co_adaptation(-1.0)"}, "weight .*negative"),
+        ({"density": "adaptive + adaptive"}, "one density strategy, got 2"),
         ({"renderer": ""}, "expected one renderer, got 0"),
     ],
 )
@@ -134,21 +134,21 @@ def test_only_what_the_renderer_lacks_is_named(monkeypatch):
         needs = frozenset({"absgrad", "models", "moments"})
 
     monkeypatch.setitem(DENSITY._factories, "greedy", Greedy)
-    with pytest.raises(ValueError, match="greedy needs moments, which the renderer gsplat lacks"):
+    with pytest.raises(ValueError, match=r"greedy .*moments, .*gsplat"):
         check(TrainConfig(density="greedy", models=2, renderer="gsplat"))
 
 
 @pytest.mark.parametrize("regularizer", [{"dropout": 0.2}, {"noise": 0.8}])
 def test_regularizers_that_never_begin_are_refused(regularizer):
     """They would scale opacities at test time, of a model that never met them."""
-    with pytest.raises(ValueError, match=r"regularize_from must be below iterations \(5\), got 5"):
+    with pytest.raises(ValueError, match=r"regularize_from .*iterations \(5\), got 5"):
         TrainConfig(iterations=5, regularize_from=5, **regularizer)
     assert TrainConfig(iterations=5, regularize_from=4, **regularizer).regularize_from == 4
     assert TrainConfig(iterations=5, regularize_from=5).regularize_from == 5
 
 
 def test_an_expectation_needs_something_random():
-    with pytest.raises(ValueError, match="set dropout, noise or regularizer"):
+    with pytest.raises(ValueError, match="set dropout, noise"):
         TrainConfig(analytic=True)
     assert TrainConfig(analytic=True, noise=0.1, loss="photometric + co_adaptation(2.0)").analytic
 
@@ -157,5 +157,5 @@ def test_settings_of_an_older_version_are_read_and_their_names_refused():
     old = dataclasses.asdict(TrainConfig(dropout=0.2))
     old |= {"renderer": "torch", "fields": old.pop("models") + 1}
     assert saved_config(old, "config.json") == TrainConfig(dropout=0.2, models=2)
-    with pytest.raises(ValueError, match="the renderer 'torch' is called 'builtin' now"):
+    with pytest.raises(ValueError, match=r"renderer 'torch' .*'builtin'"):
         TrainConfig(renderer="torch")

@@ -31,7 +31,7 @@ def test_a_run_with_gsplat_is_the_run_with_the_own_renderer(tiny_scene, busy, mo
 def test_the_choice_is_checked(tiny_scene):
     with pytest.raises(RuntimeError, match="--renderer builtin"):
         Trainer(tiny_scene, TrainConfig(renderer="gsplat"))
-    with pytest.raises(ValueError, match="there is no renderer 'cuda'; choose one of builtin, gsplat"):
+    with pytest.raises(ValueError, match=r"renderer 'cuda'; .*builtin, gsplat"):
         check(TrainConfig(renderer="cuda"))
-    with pytest.raises(ValueError, match="analytic training needs the moments of the builtin renderer"):
+    with pytest.raises(ValueError, match=r"analytic .*moments .*builtin"):
         check(TrainConfig(renderer="gsplat", analytic=True, dropout=0.2))

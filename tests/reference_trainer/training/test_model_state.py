@@ -95,7 +95,7 @@ def test_unseen_points_stay_as_they_began(tiny_scene):
 def test_no_point_in_view_says_what_to_do(tiny_scene):
     points = PointCloud(BEHIND.repeat(5, 1) + torch.arange(5.0)[:, None], torch.rand(5, 3), "behind")
     scene = dataclasses.replace(tiny_scene, points=points, train=(View("a", camera(), torch.zeros(3, 24, 32)),))
-    with pytest.raises(ValueError, match=r"no initial Gaussian .* training view.*other points"):
+    with pytest.raises(ValueError, match=r"no initial Gaussian .*training view"):
         initial_gaussians(scene, TrainConfig(initial_points="seen"))
 
 
@@ -126,7 +126,7 @@ def test_models_start_alike_and_draw_on_their_own(tiny_scene):
     starts = [model.gaussians for model in trainer.models]
     assert all(torch.equal(starts[0].means, each.means) for each in starts)
     assert len({each.means.data_ptr() for each in starts}) == 3
-    steps = trainer._begin_steps()
+    steps = trainer.begin_steps()
     for step in steps:
         step.sample(depth=False)
     assert len({step.view.name for step in steps}) == 1
@@ -182,10 +182,10 @@ def test_a_damaged_second_model_is_refused(tiny_scene, tmp_path, change, said):
 
 @pytest.mark.parametrize("settings", [{"loss": "photometric + co_regularization"}, {"density": "co_pruning"}])
 def test_what_compares_models_needs_two(settings):
-    with pytest.raises(ValueError, match="compares models, of which there is one: set models=2"):
+    with pytest.raises(ValueError, match=r"compares models, .*models=2"):
         check(TrainConfig(**settings))
     check(TrainConfig(**settings, models=2))
-    with pytest.raises(ValueError, match="models must be at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"models .*1, got 0"):
         TrainConfig(models=0)
 
 
@@ -193,7 +193,7 @@ def test_all_models_train_over_one_random_background(tiny_scene):
     trainer = Trainer(tiny_scene, TrainConfig(iterations=9, models=2, random_background=True))
     colors = []
     for _ in range(3):
-        steps = trainer._begin_steps()
+        steps = trainer.begin_steps()
         assert torch.equal(steps[0].background, steps[1].background)
         colors.append(steps[0].background)
         steps[0].sample(depth=False)
@@ -205,7 +205,7 @@ def test_all_models_train_over_one_random_background(tiny_scene):
     assert len({tuple(color.tolist()) for color in colors}) == 3
     assert torch.equal(model_of(trainer).background, tiny_scene.background)
     views = tuple(dataclasses.replace(view, alpha=torch.ones(24, 32)) for view in tiny_scene.train)
-    with pytest.raises(ValueError, match="lie on a background already"):
+    with pytest.raises(ValueError, match="a background already"):
         Trainer(dataclasses.replace(tiny_scene, train=views), trainer.config)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 
 import pytest
 import torch
@@ -124,7 +125,7 @@ def test_from_the_command_line(ply, tmp_path, capsys, monkeypatch, command):
     assert len(trained.gaussians) == 60
     assert (trained.gaussians.means - model().means).abs().max() < 0.05
     if command == "train":
-        assert "starts from the 60 Gaussians of degree 2 in point_cloud.ply" in capsys.readouterr().out
+        assert re.search(r"60 Gaussians of degree 2 .*point_cloud\.ply", capsys.readouterr().out)
         main(arguments)
         assert "complete, nothing to do" in capsys.readouterr().out
 
@@ -137,10 +138,10 @@ def plain_cloud(path):
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (plain_cloud, "points are for --points: .* is not a 3D Gaussian Splatting PLY: its vertices lack f_dc_0"),
-        (lambda path: path.write_text("no"), "points are for --points: .* is not a PLY file"),
-        (lambda path: save_ply(model(), path, bake_p=0.2), "holds opacities of the test, not the plain ones: give"),
-        (lambda path: save_ply(model(), path, opacities=torch.rand(60)), "holds opacities of the test"),
+        (plain_cloud, "for --points: .* not a 3D Gaussian Splatting PLY: its vertices lack f_dc_0"),
+        (lambda path: path.write_text("no"), "for --points: .* not a PLY file"),
+        (lambda path: save_ply(model(), path, bake_p=0.2), "holds opacities of the test, not the plain ones"),
+        (lambda path: save_ply(model(), path, opacities=torch.rand(60)), "opacities of the test"),
         (lambda path: save_ply(model()[:0], path), "holds no Gaussians"),
     ],
 )
@@ -151,7 +152,7 @@ def test_what_is_no_start(tmp_path, write, message):
 
 
 def test_no_file_and_two_starts(ply):
-    with pytest.raises(FileNotFoundError, match=r"there is no model nowhere\.ply to start from"):
+    with pytest.raises(FileNotFoundError, match=r"no model nowhere\.ply"):
         scene_with("nowhere.ply")
-    with pytest.raises(ValueError, match="init takes the place of points: leave out one of"):
+    with pytest.raises(ValueError, match=r"init .*points: leave out"):
         load_scene(SceneOptions("synthetic", init=str(ply), points="random"))

@@ -99,9 +99,7 @@ def test_a_second_ctrl_c_does_not_wait(tiny_scene, monkeypatch):
     assert trainer.step == 0
 
 
-@pytest.mark.parametrize(
-    ("steps", "said"), [(3, "step 4 cannot be rendered: means must be finite"), (4, "nan or infinite by step 4")]
-)
+@pytest.mark.parametrize(("steps", "said"), [(3, "step 4 .*means .*finite"), (4, "infinite by step 4")])
 def test_gaussians_that_are_not_numbers_stop_before_anything_is_pruned(tiny_scene, steps, said):
     trainer = Trainer(tiny_scene, TrainConfig(iterations=9, densify_from=1, densify_every=4))
     trainer.train(until=steps)
@@ -115,9 +113,9 @@ def test_gaussians_that_are_not_numbers_stop_before_anything_is_pruned(tiny_scen
 def test_checkpoints_of_another_scene_are_refused(tiny_scene, busy, tmp_path):
     path = tmp_path / "checkpoint.pt"
     Trainer(tiny_scene, busy).save(path)
-    with pytest.raises(ValueError, match=r"checkpoint\.pt was trained on the scene 'synthetic', this one is 'fern'"):
+    with pytest.raises(ValueError, match=r"checkpoint\.pt .*scene 'synthetic', .*'fern'"):
         Trainer.load(path, dataclasses.replace(tiny_scene, name="fern"))
-    with pytest.raises(ValueError, match=r"checkpoint\.pt was trained on the views .*train_2.*the scene has"):
+    with pytest.raises(ValueError, match=r"checkpoint\.pt .*views .*train_2"):
         Trainer.load(path, dataclasses.replace(tiny_scene, train=tiny_scene.train[:2]))
 
 
@@ -194,7 +192,7 @@ def with_first_pixel(scene: Scene, value: float) -> Scene:
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_loss_that_is_not_finite_stops_before_it_does_harm(tiny_scene, value):
     trainer = Trainer(with_first_pixel(tiny_scene, value), TrainConfig(iterations=9))
-    with pytest.raises(TrainingStoppedError, match=r"the loss became (nan|inf) at step [123]"):
+    with pytest.raises(TrainingStoppedError, match=r"loss .*(nan|inf) at step [123]"):
         trainer.train()
     assert trainer.step < 3  # the view is met in the first epoch
     assert all(torch.isfinite(x).all() and x.grad is None for _, x in trainer.gaussians.named())
@@ -203,7 +201,7 @@ def test_a_loss_that_is_not_finite_stops_before_it_does_harm(tiny_scene, value):
 def test_a_model_without_gaussians_stops(tiny_scene):
     config = TrainConfig(iterations=9, densify_from=1, densify_every=2, prune_opacity=0.99)
     trainer = Trainer(tiny_scene, config)
-    with pytest.raises(TrainingStoppedError, match="all Gaussians were pruned after step 2"):
+    with pytest.raises(TrainingStoppedError, match="pruned after step 2"):
         trainer.train()
 
 

@@ -1,6 +1,8 @@
 import dataclasses
+import math
 import sys
 import time
+from contextlib import nullcontext
 from io import BytesIO
 from itertools import cycle
 from types import SimpleNamespace
@@ -21,7 +23,7 @@ from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.scenes.virtual_cameras import measured_views, orbit_views
 from reference_trainer.viewer import window
 from reference_trainer.viewer.picture import DisplayOptions, ViewerModel
-from reference_trainer.viewer.window import MOST, Viewer, _camera, _level, _pose
+from reference_trainer.viewer.window import Viewer
 
 
 class Client:
@@ -30,43 +32,133 @@ class Client:
     client_id = 7
 
     def __init__(self, camera):
-        self.shown = []
-        at = _pose(camera, 1.0)
-        axes = camera.world_to_camera[:3, :3].T.double().numpy()
-        wxyz = pytest.importorskip("viser").transforms.SO3.from_matrix(axes).wxyz
-        self.camera = SimpleNamespace(
-            image_width=camera.width, image_height=camera.height, wxyz=wxyz, position=at["position"], fov=at["fov"],
-            on_update=lambda call: None,
-        )  # fmt: skip
+        self.shown, self.files, self._moved = [], {}, None
+        self.camera = SimpleNamespace(on_update=lambda call: setattr(self, "_moved", call))
+        self.stand_at(camera)
         self.scene = SimpleNamespace(set_background_image=lambda image, **_: self.shown.append(image))
-        self.files = {}
         self.send_file_download = lambda name, content, **_: self.files.update({name: content})
+        self.atomic = nullcontext
+
+    def stand_at(self, camera):
+        """Look out of a camera, and tell nobody."""
+        quaternion = Rotation.from_matrix(camera.world_to_camera[:3, :3].T.double().numpy()).as_quat()  # x, y, z, w
+        vars(self.camera).update(
+            image_width=camera.width, image_height=camera.height, wxyz=np.roll(quaternion, 1),
+            position=camera.position.numpy(), fov=2 * math.atan(0.5 * camera.height / camera.fy),
+        )  # fmt: skip
+
+    def move(self, camera=None):
+        """Somebody moves to a camera, or only touches it."""
+        if camera is not None:
+            self.stand_at(camera)
+        self._moved(self.camera)
+
+    @property
+    def picture(self):
+        """The last one that it was sent, (3, H, W)."""
+        return torch.from_numpy(self.shown[-1].copy()).permute(2, 0, 1) / 255
+
+
+class Handle(SimpleNamespace):
+    """A part of the panel or of the scene: somebody changes its value, or clicks on it."""
+
+    def __init__(self, value=None, **rest):
+        super().__init__(value=value, calls=[], **rest)
+        self.on_update = self.on_click = self.calls.append
+
+    def change(self, value, client=None):
+        self.value = value
+        for call in self.calls:
+            call(SimpleNamespace(client=client))
+
+
+class Server:
+    """What `Viewer` uses of viser's server, without a port: its panel by the labels, its scene, and pages that come."""
+
+    def __init__(self, *_, **__):
+        self.panel, self.frusta, self.up, self.connect = {}, [], None, None
+        self.initial_camera = SimpleNamespace()
+        self.gui = SimpleNamespace(
+            configure_theme=lambda **_: None,
+            add_dropdown=lambda label, options, **_: self._add(label, options[0]),
+            add_slider=lambda label, low, high, step, value, **_: self._add(label, value),
+            add_checkbox=lambda label, value, **_: self._add(label, value),
+            add_button_group=lambda label, options, **_: self._add(label, options[0]),
+            add_image=lambda image, label, **rest: self._add(label, image=image, **rest),
+            add_markdown=lambda content: self._add("status", content=content),
+        )
+        self.scene = SimpleNamespace(
+            set_up_direction=lambda up: setattr(self, "up", torch.tensor(up)),
+            add_frame=lambda *_, **__: Handle(),
+            add_camera_frustum=lambda name, fov, aspect, **rest: self.frusta.append(Handle(**rest)) or self.frusta[-1],
+        )
+        self.on_client_connect = lambda call: setattr(self, "connect", call)
+        self.on_client_disconnect = self.stop = lambda *_: None
+
+    def _add(self, label, value=None, **rest):
+        self.panel[label] = Handle(value, **rest)
+        return self.panel[label]
+
+    @property
+    def status(self):
+        """The text of the panel."""
+        return self.panel["status"].content
 
 
 @pytest.fixture
-def viewer():
-    pytest.importorskip("viser")
+def server(monkeypatch):
+    """That of the next viewer."""
+    server = Server()
+    monkeypatch.setattr(pytest.importorskip("viser"), "ViserServer", lambda *_, **__: server)
+    return server
+
+
+@pytest.fixture
+def viewer(server):
     with Viewer(0) as viewer:
         yield viewer
 
 
-def test_a_camera_of_the_page_is_the_one_that_was_jumped_to(run):
-    for view in load_run_model(run[0])[1].train:
-        camera = _camera(Client(view.camera).camera, MOST)
-        torch.testing.assert_close(camera.world_to_camera, view.camera.world_to_camera, rtol=1e-5, atol=1e-5)
-        assert (camera.width, camera.height) == (view.camera.width, view.camera.height)
-        assert camera.fy == pytest.approx(view.camera.fy)
-    assert _camera(Client(view.camera.resized(4000, 1000)).camera, MOST).width == 2000
+def camera_of(page):
+    """The camera that a page of viser's stands for."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(np.roll(page.wxyz, -1)).as_matrix()
+    pose[:3, 3] = page.position
+    focal, width, height = 0.5 * page.image_height / math.tan(0.5 * page.fov), page.image_width, page.image_height
+    inverse = torch.from_numpy(np.linalg.inv(pose)).float()
+    return Camera(inverse, focal, focal, width / 2, height / 2, width, height)
 
 
-def test_a_picture_is_rough_while_somebody_moves_and_full_afterwards(run, viewer, monkeypatch):
+def test_a_page_shows_what_the_camera_sees_that_it_jumps_to(run, viewer, server):
+    model, scene = load_run_model(run[0])
+    viewer.show(model, {"train": scene.train})
+    client = Client(scene.train[0].camera.resized(4000, 1000))
+    server.connect(client)
+    client.settle = lambda: [viewer.update(), time.sleep(window.STILL), viewer.update()]
+    client.settle()
+    assert client.picture.shape == (3, 500, 2000)  # at most
+    for frustum, view in zip(server.frusta, scene.train, strict=True):
+        frustum.change(None, client)
+        position, ahead = view.camera.position, view.camera.world_to_camera[2, :3]
+        np.testing.assert_allclose(client.camera.position, position, atol=1e-6)
+        toward = torch.from_numpy(client.camera.look_at) - position
+        torch.testing.assert_close(toward / toward.norm(), ahead, rtol=0, atol=1e-5)
+        assert client.camera.fov == pytest.approx(2 * math.atan(0.5 * view.camera.height / view.camera.fy))
+        client.move(view.camera)  # as the page does with what it was told
+        client.settle()
+        expected = render_gaussians(
+            model.gaussians, view.camera, model.background, opacities=0.8 * model.gaussians.opacities
+        )
+        torch.testing.assert_close(client.picture, expected.image.clamp(0, 1), rtol=0, atol=0.51 / 255)
+
+
+def test_a_picture_is_rough_while_somebody_moves_and_full_afterwards(run, viewer, server, monkeypatch):
     clock = [100.0]
     monkeypatch.setattr(window, "time", SimpleNamespace(monotonic=lambda: clock[0], perf_counter=time.perf_counter))
     model, scene = load_run_model(run[0])
     viewer.show(model, measured_views(scene))
-    camera = scene.train[0].camera.resized(640, 480)
-    client = Client(camera)
-    viewer._connected(client)
+    client = Client(scene.train[0].camera.resized(640, 480))
+    server.connect(client)
     for _ in range(2):
         assert viewer.update() == pytest.approx(window.STILL)
         assert client.shown[-1].shape[0] < 480
@@ -75,76 +167,74 @@ def test_a_picture_is_rough_while_somebody_moves_and_full_afterwards(run, viewer
         clock[0] += 0.25 * window.STILL
         assert viewer.update() is None
         expected = render_gaussians(
-            model.gaussians, _camera(client.camera, MOST), model.background, opacities=0.8 * model.gaussians.opacities
+            model.gaussians, camera_of(client.camera), model.background, opacities=0.8 * model.gaussians.opacities
         )
-        shown = torch.from_numpy(client.shown[-1].copy()).permute(2, 0, 1) / 255
-        torch.testing.assert_close(shown, expected.image.clamp(0, 1), rtol=0, atol=0.5001 / 255)
-        viewer._moved()
+        torch.testing.assert_close(client.picture, expected.image.clamp(0, 1), rtol=0, atol=0.51 / 255)
+        client.move()
     assert len(client.shown) == 4
-    viewer._controls[0].value = "heat"
-    viewer._models[""] = ViewerModel(model, [])  # no view has a score: a word instead of heat
-    viewer._moved()
+    viewer.show(model, {})  # no view has a score: a word instead of heat
+    server.panel["Show"].change("heat")
     clock[0] += window.STILL
     viewer.update()
-    assert "none of the 0 views" in viewer._status.content
+    assert "none of the 0 views" in server.status
     np.testing.assert_array_equal(client.shown[-1], client.shown[-2])
 
 
 @pytest.fixture
-def page(run, viewer):
+def page(run, viewer, server):
     """A page at the first training camera, its picture rendered in full."""
     model, scene = load_run_model(run[0])
     viewer.show(model, measured_views(scene), "mine")
     client = Client(scene.train[0].camera)
-    viewer._connected(client)
+    server.connect(client)
     client.settle = lambda: [viewer.update(), time.sleep(window.STILL), viewer.update()]
     client.settle()
     return client
 
 
-def test_the_camera_that_a_page_looks_out_of_is_hidden(run, viewer, page):
+def save(server, page, what):
+    """Somebody presses a button of the panel."""
+    server.panel["Save"].change(what, page)
+
+
+def test_the_camera_that_a_page_looks_out_of_is_hidden(run, server, page):
     cameras = [view.camera for of in measured_views(load_run_model(run[0])[1]).values() for view in of]
-    assert [frustum.visible for _, frustum in viewer._frusta] == [False] + [True] * (len(cameras) - 1)
-    page.camera = Client(cameras[1]).camera
-    viewer._moved()
+    assert [frustum.visible for frustum in server.frusta] == [False] + [True] * (len(cameras) - 1)
+    page.move(cameras[1])
     page.settle()
-    assert [frustum.visible for _, frustum in viewer._frusta] == [i != 1 for i in range(len(cameras))]
+    assert [frustum.visible for frustum in server.frusta] == [i != 1 for i in range(len(cameras))]
 
 
-def test_a_photograph_is_laid_over_its_own_camera_only(run, viewer, page):
+def test_a_photograph_is_laid_over_its_own_camera_only(run, viewer, server, page):
     view = load_run_model(run[0])[1].train[0]
-    viewer._photograph.value = 100
-    viewer._moved()
+    server.panel["Photograph %"].change(100)
     page.settle()
-    shown = torch.from_numpy(page.shown[-1].copy()).permute(2, 0, 1) / 255
-    torch.testing.assert_close(shown, view.image, rtol=0, atol=0.51 / 255)
+    torch.testing.assert_close(page.picture, view.image, rtol=0, atol=0.51 / 255)
     page.camera.position = page.camera.position + np.array([0.5, 0, 0])
-    viewer._moved()
+    page.move()
     page.settle()
-    assert "no photograph from here" in viewer._status.content
-    viewer._ask(page, "screenshot")
+    assert "no photograph from here" in server.status
+    save(server, page, "screenshot")
     viewer.update()
     with Image.open(BytesIO(page.files["view.png"])) as file:
         assert file.size[0] >= page.shown[-1].shape[1]
 
 
 @pytest.mark.slow
-def test_two_models_share_the_width_and_a_screenshot_names_them(run, scaled, viewer, page):
+def test_two_models_share_the_width_and_a_screenshot_names_them(run, scaled, viewer, server, page):
     model, scene = load_run_model(scaled[0])
     viewer.show(model, measured_views(scene), "other")
-    viewer._controls[0].value = "co-adaptation"
-    viewer._moved()
+    server.panel["Show"].change("co-adaptation")
     page.settle()
-    camera = _camera(page.camera, MOST)
+    camera = camera_of(page.camera)
     half = dataclasses.replace(camera, width=camera.width // 2, cx=camera.width / 4)
     parts = [load_run_model(folder)[0] for folder in (run[0], scaled[0])]
     pictures = [ViewerModel(part, []).render(DisplayOptions("co-adaptation"), half) for part in parts]
-    shown = torch.from_numpy(page.shown[-1].copy()).permute(2, 0, 1) / 255
     expected = torch.cat([picture.image for picture in pictures], 2)
-    torch.testing.assert_close(shown, expected, rtol=0, atol=0.51 / 255)
-    assert all(f"**{name}**" in viewer._status.content for name in ("mine", "other"))
-    assert not any(frustum.visible for _, frustum in viewer._frusta)
-    viewer._ask(page, "screenshot")
+    torch.testing.assert_close(page.picture, expected, rtol=0, atol=0.51 / 255)
+    assert all(f"**{name}**" in server.status for name in ("mine", "other"))
+    assert not any(frustum.visible for frustum in server.frusta)
+    save(server, page, "screenshot")
     viewer.update()
     with Image.open(BytesIO(page.files["view.png"])) as file:
         sheet = np.asarray(file.convert("RGB")) / 255
@@ -157,16 +247,16 @@ def test_two_models_share_the_width_and_a_screenshot_names_them(run, scaled, vie
         )  # fmt: skip
 
 
-def test_a_flight_along_added_cameras_is_a_movie(run, viewer, page, monkeypatch):
+def test_a_flight_along_added_cameras_is_a_movie(run, viewer, server, page, monkeypatch):
     monkeypatch.setattr(window, "MOVIE_FRAMES", 6)
-    viewer._ask(page, "flight")  # nowhere to fly to
+    save(server, page, "flight")  # nowhere to fly to
     viewer.update()
     assert not page.files
     for view in load_run_model(run[0])[1].train[:2]:
-        page.camera = Client(view.camera).camera
-        viewer._ask(page, "add to path")
-    assert "2 cameras" in viewer._status.content
-    viewer._ask(page, "flight")
+        page.move(view.camera)
+        save(server, page, "add to path")
+    assert "2 cameras" in server.status
+    save(server, page, "flight")
     viewer.update()
     ((name, content),) = page.files.items()
     assert name in ("flight.webp", "flight.mp4")
@@ -176,7 +266,7 @@ def test_a_flight_along_added_cameras_is_a_movie(run, viewer, page, monkeypatch)
             assert movie.size[0] >= view.camera.width
 
 
-def test_a_flight_of_two_models_has_pictures_of_one_size_whatever_their_notes(run, viewer, page, monkeypatch):
+def test_a_flight_of_two_models_has_pictures_of_one_size_whatever_their_notes(run, viewer, server, page, monkeypatch):
     monkeypatch.setattr(window, "MOVIE_FRAMES", 4)
     monkeypatch.setitem(sys.modules, "av", None)  # a WebP, which cannot be of several sizes
     rendered, lengths = ViewerModel.render, cycle(range(9))
@@ -184,15 +274,15 @@ def test_a_flight_of_two_models_has_pictures_of_one_size_whatever_their_notes(ru
     model, scene = load_run_model(run[0])
     viewer.show(model, measured_views(scene), "other")
     for view in scene.train[:2]:
-        page.camera = Client(view.camera.resized(64, 48)).camera  # narrower than its title
-        viewer._ask(page, "add to path")
-    viewer._ask(page, "flight")
+        page.move(view.camera.resized(64, 48))  # narrower than its title
+        save(server, page, "add to path")
+    save(server, page, "flight")
     viewer.update()
     with Image.open(BytesIO(page.files["flight.webp"])) as movie:
         assert movie.n_frames == 5
 
 
-def test_up_is_across_the_horizontal_axes_of_cameras_held_level():
+def test_up_is_across_the_horizontal_axes_of_cameras_held_level(run, viewer, server, monkeypatch):
     def held(yaw, pitch, roll=0.0):
         """World up is z; OpenCV axes."""
         base = Rotation.from_euler("ZXZ", [yaw, -90 - pitch, roll], degrees=True).as_matrix()
@@ -200,32 +290,46 @@ def test_up_is_across_the_horizontal_axes_of_cameras_held_level():
         pose[:3, :3] = torch.tensor(base.T, dtype=torch.float32)
         return Camera(pose, 50.0, 50.0, 16.0, 12.0, 32, 24)
 
+    model = load_run_model(run[0])[0]
+
+    def level(cameras):
+        with Viewer(0) as other:  # the cameras of one are those of its first model
+            other.show(model, {"train": [Viewpoint(str(number), camera) for number, camera in enumerate(cameras)]})
+        return server.up
+
     around = [held(yaw, pitch) for yaw, pitch in zip(range(0, 360, 45), [10, 30, -20, 0, 5, 40, 15, 25], strict=True)]
-    assert _level(around) @ torch.tensor([0, 0, 1.0]) == pytest.approx(1, abs=1e-3)
+    up = torch.tensor([0, 0, 1.0])
+    assert level(around) @ up == pytest.approx(1, abs=1e-3)
     ahead = [held(-5, 20), held(0, 25), held(7, 15, roll=6)]  # one of them is rolled
     mean = torch.stack([-camera.world_to_camera[1, :3] for camera in ahead]).mean(0)
-    level = ahead[0].world_to_camera[0, :3]
-    assert abs(_level(ahead) @ level) < 0.06
-    assert torch.allclose(_level(ahead[:1]), -ahead[0].world_to_camera[1, :3], atol=1e-6)
-    assert _level(ahead) @ mean > 0.9
+    horizontal = ahead[0].world_to_camera[0, :3]
+    assert abs(level(ahead) @ horizontal) < 0.06
+    assert level(ahead) @ mean > 0.9
+    assert torch.allclose(level(ahead[:1]), -ahead[0].world_to_camera[1, :3], atol=1e-6)
     # A camera that is rolled slightly is leveled; a portrait, or one that looks straight down, stays as it is.
-    up = torch.tensor([0, 0, 1.0])
-    for camera, leveled in ((held(7, 15, 6), True), (held(0, 0, 90), False), (held(0, -90), False)):
-        own = (-camera.world_to_camera[1, :3]).numpy()
-        np.testing.assert_array_equal(_pose(camera, 1.0, up)["up_direction"], up.numpy() if leveled else own)
+    server.frusta.clear()
+    rolled = {held(7, 15, 6): True, held(0, 0, 90): False, held(0, -90): False}
+    up = level([*around, *rolled])
+    client = Client(around[0])
+    for frustum, (camera, leveled) in zip(server.frusta[len(around) :], rolled.items(), strict=True):
+        frustum.change(None, client)
+        own = -camera.world_to_camera[1, :3]
+        np.testing.assert_array_equal(client.camera.up_direction, (up if leveled else own).numpy())
 
 
 @pytest.mark.slow
-def test_a_training_that_is_watched_ends_with_the_same_model(run, options, short, tmp_path, viewer):
+def test_a_training_that_is_watched_ends_with_the_same_model(
+    run, options, short, tmp_path, viewer, server, monkeypatch
+):
+    monkeypatch.setattr(window, "TRAINING_SHARE", 1)  # every state of it is shown
     client = Client(load_scene(options).train[0].camera)
-    viewer._connected(client)
+    server.connect(client)
     modes = cycle(["render", "co-adaptation", "depth", "heat"])
 
     def watch(trainer):
-        viewer._next_model = 0.0
-        viewer._controls[0].value = next(modes)
-        viewer._controls[3].value = True
-        viewer._controls[4].value = 0.0 if trainer.step < 9 else 20.0
+        server.panel["Show"].change(next(modes))
+        server.panel["Draw a mask"].change(True)
+        server.panel["Hide %"].change(0.0 if trainer.step < 9 else 20.0)
         viewer.follow(trainer)
 
     results = run_experiment(options, short, tmp_path, monitoring=Monitoring(0), on_step=watch)
@@ -233,23 +337,25 @@ def test_a_training_that_is_watched_ends_with_the_same_model(run, options, short
     assert (tmp_path / "point_cloud.ply").read_bytes() == (run[0] / "point_cloud.ply").read_bytes()
 
 
-def test_a_model_on_a_card_is_shown_from_an_orbit_around_it(run, viewer, card):
+def test_a_model_on_a_card_is_shown_from_an_orbit_around_it(run, viewer, server, card):
     model, _ = load_run_model(run[0], str(card))
     cameras = orbit_views(model.gaussians.means, model.gaussians.opacities, count=3, width=32, height=24)
     viewer.show(model, {"orbit": [Viewpoint(str(number), camera) for number, camera in enumerate(cameras)]})
     first = cameras[0].position.cpu().numpy()
-    np.testing.assert_allclose(viewer._server.initial_camera.position, first, rtol=1e-6)
+    np.testing.assert_allclose(server.initial_camera.position, first, rtol=1e-6)
 
 
-def test_an_idle_page_waits_for_a_limited_time(viewer, monkeypatch):
+def test_an_idle_page_waits_for_a_limited_time(server, monkeypatch):
     waits = []
 
     def wait(timeout=None):
         waits.append(timeout)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(viewer._changed, "wait", wait)
-    viewer.serve()
+    event = SimpleNamespace(wait=wait, set=lambda: None, clear=lambda: None)
+    monkeypatch.setattr(window, "threading", SimpleNamespace(Event=lambda: event))
+    with Viewer(0) as viewer:
+        viewer.serve()
     assert 0 < waits[0] <= 1  # on Windows, Ctrl-C is not heard before the end of a wait
 
 
@@ -259,9 +365,12 @@ def test_a_training_that_nobody_looks_at_is_left_alone(viewer):
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium, such as Debian's package chromium")
-def test_a_browser_shows_what_was_rendered(run, viewer):
+def test_a_browser_shows_what_was_rendered(run, monkeypatch):
+    """With viser's own server."""
+    viser, servers = pytest.importorskip("viser"), []
+    served = viser.ViserServer
+    monkeypatch.setattr(viser, "ViserServer", lambda *of, **named: servers.append(served(*of, **named)) or servers[-1])
     model, scene = load_run_model(run[0])
-    viewer.show(model, measured_views(scene))
 
     def picture(page, mode):
         """Draw what is asked for until the page shows it below its panel; return it, and what it should be."""
@@ -269,16 +378,16 @@ def test_a_browser_shows_what_was_rendered(run, viewer):
         while time.monotonic() < last:
             viewer.update()
             page.run("new Promise(requestAnimationFrame)")
-            if viewer._windows and viewer._options.mode == mode:
-                (only,) = viewer._windows.values()
-                expected = viewer._models[""].render(DisplayOptions(mode), _camera(only.client.camera, MOST)).image
+            for client in servers[0].get_clients().values():
+                expected = ViewerModel(model, []).render(DisplayOptions(mode), camera_of(client.camera)).image
                 shown = page.picture()[:, 330:, :500]
                 expected = expected[:, 330:, :500]
                 if shown.shape == expected.shape and (shown - expected).abs().mean() < 0.02:
                     return shown
         pytest.fail(f"{mode} is not shown")
 
-    with Page(viewer.address, 900, 500) as page:
+    with Viewer(0) as viewer, Page(viewer.address, 900, 500) as page:
+        viewer.show(model, measured_views(scene))
         render = picture(page, "render")
         page.run("document.querySelector('input[value=render]').click()")
         page.run("[...document.querySelectorAll('[role=option]')].find(x => x.textContent == 'depth').click()")

@@ -29,9 +29,9 @@ def package(monkeypatch):
     pytest.importorskip("gsplat.cuda._torch_impl", exc_type=ImportError)
     package = stand_in.package(max_alpha=0.999)
     monkeypatch.setattr(module, "load_gsplat", lambda device: package)
-    module._largest_alpha.cache_clear()
+    module.largest_alpha.cache_clear()
     yield package
-    module._largest_alpha.cache_clear()
+    module.largest_alpha.cache_clear()
 
 
 @pytest.fixture

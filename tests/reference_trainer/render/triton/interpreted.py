@@ -341,7 +341,7 @@ def test_what_it_cannot_do_is_refused_by_name():
     s = scene(3, 9, 7).to(torch.float32, DEVICE)
     use_engine("triton")
     moving = Camera(s.camera.world_to_camera.clone().requires_grad_(), 9.0, 9.0, 4.0, 3.0, 9, 7)
-    with pytest.raises(NotImplementedError, match="triton has no gradient of the camera's pose"):
+    with pytest.raises(NotImplementedError, match=r"triton .*camera's pose"):
         splat(*s[:4], moving, colors=s.colors)
 
 

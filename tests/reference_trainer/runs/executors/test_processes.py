@@ -1,6 +1,7 @@
 """Real processes, killed for real."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -47,13 +48,13 @@ def test_a_killed_worker_is_replaced_and_takes_no_other_task_with_it(tmp_path, s
     killer.join()
     assert outcomes == {0: Value(25), 1: Value(4)}
     assert len(said) == 1
-    assert said[0].startswith("victim: the worker was killed by SIGKILL, as the system does when memory runs out")
+    assert re.match("victim: .*SIGKILL, .*memory", said[0])
 
 
 @pytest.mark.slow
 def test_a_worker_that_leaves_without_an_answer():
     outcomes = dict(run_all(Processes(1), [Task("leave", sweep_tasks.leave, ())], retries=0))
-    assert outcomes[0].error == "the worker ended with exit code 7 and no answer"
+    assert "exit code 7" in outcomes[0].error
 
 
 @pytest.mark.slow
@@ -84,5 +85,5 @@ def test_a_worker_is_interrupted_once_however_its_parent_ends(tmp_path, number):
 
 
 def test_no_job_is_refused():
-    with pytest.raises(ValueError, match="at least 1 job, got 0"):
+    with pytest.raises(ValueError, match="1 job, got 0"):
         Processes(0)

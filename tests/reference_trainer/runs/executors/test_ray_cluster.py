@@ -1,6 +1,7 @@
 """Ray on this machine with a worker killed for real; what it is asked for on other machines, by a stand-in."""
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -154,5 +155,5 @@ def test_a_sweep_on_ray_with_a_worker_killed(tmp_path, monkeypatch, said):
     assert pid != os.getpid()
     assert threads == max(2, os.cpu_count()) // 2
     assert len(said) == 1
-    assert said[0].startswith("victim: the worker died (WorkerCrashedError")
+    assert re.match(r"victim: .*\(WorkerCrashedError", said[0])
     assert said[0].endswith("; again with another (1 of 3)")

@@ -113,6 +113,6 @@ def test_numbers_tables_and_picture(made_up, tmp_path, said):
 def test_a_defect_fails_after_everything_is_written(made_up, tmp_path):
     nan = Probe(lambda: {"image": torch.tensor([math.nan])}, lambda: {"image": torch.ones(1).double()})
     made_up(*MADE_UP, single("third", "gives nan", lambda: nan, renders=False))
-    with pytest.raises(RuntimeError, match="1 cases do not end as they should:\n  third: gives nan"):
+    with pytest.raises(RuntimeError, match=r"^1 cases .*:\n  third: gives nan"):
         study_stability(tmp_path)
     assert {path.name[10:] for path in tmp_path.glob("stability.*")} == {"json", "md", "png"}

@@ -44,7 +44,7 @@ def test_absgrad_counts_sums_of_absolute_values_of_what_was_rendered(tiny_scene)
     trainer = Trainer(tiny_scene, config)
     expected, counts = torch.zeros(150, dtype=torch.float64), torch.zeros(150)
     for _ in range(3):
-        step = trainer._begin_steps()[0]
+        step = trainer.begin_steps()[0]
         drawn = step.regularizer.regularize(step.params, step.generator("regularizer"))
         with torch.no_grad():
             out = render_gaussians(drawn, step.view.camera, trainer.background, sh_degree=step.sh_degree)
@@ -95,5 +95,5 @@ def test_absolute_gradients_cost_nothing_unless_they_are_asked_for(tiny_scene, m
 
 
 def test_absgrad_is_refused_where_there_are_no_absolute_gradients():
-    with pytest.raises(ValueError, match="analytic training has no absolute gradients"):
+    with pytest.raises(ValueError, match=r"analytic .*absolute gradients"):
         check(TrainConfig(density="absgrad", dropout=0.2, analytic=True))

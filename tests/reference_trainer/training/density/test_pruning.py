@@ -50,7 +50,7 @@ def test_a_model_that_would_be_empty_stops_the_training(tiny_scene):
     trainer = two(tiny_scene, "co_pruning(0.4, every=5)", densify_from=0)
     with torch.no_grad():
         trainer.models[1].gaussians.means.add_(100)
-    with pytest.raises(TrainingStoppedError, match=r"within 0\.4 after step 5: raise distance"):
+    with pytest.raises(TrainingStoppedError, match=r"within 0\.4 .*step 5: .*distance"):
         trainer.density.together(trainer.models, 5)
 
 

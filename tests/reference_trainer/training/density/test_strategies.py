@@ -66,7 +66,7 @@ def test_gaussians_that_are_not_numbers_stop_the_training_and_are_said_to(tiny_s
     trainer.train(until=6)
     with torch.no_grad():
         getattr(trainer.models[-1].gaussians, name)[0] = math.nan
-    with pytest.raises(TrainingStoppedError, match=r"finite|nan or infinite by step 6"):
+    with pytest.raises(TrainingStoppedError, match=r"finite|nan .*step 6"):
         trainer.train()
 
 
@@ -77,23 +77,23 @@ def test_gaussians_that_are_not_numbers_stop_the_training_and_are_said_to(tiny_s
         ("absgrad(split_gradient=-1.0)", "split_gradient must be positive"),
         ("absgrad(dense_fraction=0)", "dense_fraction must be positive"),
         ("absgrad(opacity_ceiling=1.0)", "opacity_ceiling must be in"),
-        ("absgrad(ceiling_every=-1)", "ceiling_every must be at least 0, got -1: 0 turns it off"),
-        ("proximity(until=-1)", "until must be at least 0, got -1: 0 unpools nothing"),
-        ("proximity(distance=0.0)", "distance and split_distance must be positive"),
-        ("mcmc(noise=-1)", "noise must be finite and at least 0, got -1: 0 turns it off"),
-        ("mcmc(growth=0.9)", "growth must be finite and at least 1, got 0.9: 1 adds nothing"),
-        ("ray_boxes(views=1)", "views must be at least 2, got 1: the rays of one do not meet"),
-        ("ray_boxes(height=0)", "height must be at least 1, got 0"),
-        ("share_pruning(every=0)", "every must be at least 1, got 0: density control without it is 'adaptive'"),
+        ("absgrad(ceiling_every=-1)", "ceiling_every .*at least 0, got -1: 0 "),
+        ("proximity(until=-1)", "until .*at least 0, got -1: 0 "),
+        ("proximity(distance=0.0)", "distance and split_distance .*positive"),
+        ("mcmc(noise=-1)", "noise .*at least 0, got -1: 0 "),
+        ("mcmc(growth=0.9)", "growth .*at least 1, got 0.9: 1 "),
+        ("ray_boxes(views=1)", "views .*at least 2, got 1"),
+        ("ray_boxes(height=0)", "height .*at least 1, got 0"),
+        ("share_pruning(every=0)", "every .*at least 1, got 0: .*'adaptive'"),
         ("share_pruning(fraction=1.0)", "fraction must be in"),
         ("share_pruning(drop_rate=0.0)", "drop_rate must be in"),
         ("co_pruning(0)", "distance must be positive"),
-        ("co_pruning(every=0)", "every must be at least 1, got 0: density control without it is 'adaptive'"),
+        ("co_pruning(every=0)", "every .*at least 1, got 0: .*'adaptive'"),
         ("self_ensembling(first=0.0)", "above 0|positive"),
-        ("self_ensembling(views=0)", "views must be at least 1, got 0"),
+        ("self_ensembling(views=0)", "views .*at least 1, got 0"),
         ("self_ensembling(share=1.0)", "share in"),
         ("self_ensembling(least=-0.1)", "least >= 0"),
-        ("co_pruning", "compares models, of which there is one: set models=2"),
+        ("co_pruning", "compares models, .*models=2"),
     ],
 )
 def test_bad_arguments_are_refused(expression, message):
@@ -115,5 +115,5 @@ def test_bad_arguments_are_refused(expression, message):
     ],
 )
 def test_counts_are_integers(expression, name):
-    with pytest.raises(ValueError, match=rf"^{re.escape(repr(expression))}: {name} must be an integer, got float"):
+    with pytest.raises(ValueError, match=f"^{re.escape(repr(expression))}: {name} .*integer, got float"):
         check(TrainConfig(density=expression))

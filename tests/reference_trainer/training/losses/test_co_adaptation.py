@@ -120,9 +120,9 @@ def test_analytic_training_takes_a_variance_of_its_own_at_virtual_views(tiny_sce
     ("text", "message"),
     [
         ("co_adaptation(p=1.0)", r"in \[0, 1\)"),
-        ("co_adaptation(where='nowhere')", "where must be training, box, line, arc, beyond, got 'nowhere'"),
-        ("co_adaptation(every=0)", "every must be at least 1, got 0: a term without steps is left out"),
-        ("co_adaptation(every=2.5)", r"'co_adaptation\(every=2\.5\)': every must be an integer, got float"),
+        ("co_adaptation(where='nowhere')", "where .*training, box, line, arc, beyond, got 'nowhere'"),
+        ("co_adaptation(every=0)", "every .*at least 1, got 0"),
+        ("co_adaptation(every=2.5)", r"'co_adaptation\(every=2\.5\)': every .*integer, got float"),
     ],
 )
 def test_bad_arguments(text, message):
@@ -132,5 +132,5 @@ def test_bad_arguments(text, message):
 
 def test_a_single_photograph_has_no_views_between(tiny_scene):
     (term,) = LOSSES.make("co_adaptation(where='arc')")
-    with pytest.raises(ValueError, match="between two training cameras, and 'synthetic' has 1"):
+    with pytest.raises(ValueError, match=r"two .*cameras, .*'synthetic' has 1"):
         term.begin(dataclasses.replace(tiny_scene, train=tiny_scene.train[:1]))

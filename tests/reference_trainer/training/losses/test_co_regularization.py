@@ -134,7 +134,7 @@ def test_bounds_are_those_of_all_points_but_two_in_a_thousand(tiny_scene):
     view = dataclasses.replace(tiny_scene.train[0], camera=camera)
     scene = dataclasses.replace(tiny_scene, train=(view,), points=PointCloud(points, points, "hand"))
     assert depth_bounds(scene) == pytest.approx((1.001, 1.999), abs=1e-6)
-    with pytest.raises(ValueError, match="has no initial point in a training picture"):
+    with pytest.raises(ValueError, match="no initial point"):
         depth_bounds(dataclasses.replace(scene, points=PointCloud(points[-2:], points[-2:], "hand")))
 
 
@@ -146,5 +146,5 @@ def test_cameras_around_an_object_are_refused(tiny_scene):
         )
         for view in tiny_scene.train
     ]
-    with pytest.raises(ValueError, match=r"mean of their axes is 0\.\d\d long"):
+    with pytest.raises(ValueError, match=r"axes is 0\.\d\d long"):
         pseudo_cameras(dataclasses.replace(tiny_scene, train=(*tiny_scene.train, *views)))

@@ -132,7 +132,7 @@ def test_it_does_not_act_without_weight_or_rate():
 def test_the_exact_form_needs_moments_of_the_renderer():
     for exact in (False, True):
         assert Consistency(exact=exact).needs == ({"moments"} if exact else set())
-    with pytest.raises(ValueError, match="the loss needs moments, which the renderer gsplat lacks"):
+    with pytest.raises(ValueError, match=r"loss .*moments, .*gsplat"):
         check(TrainConfig(loss="photometric + consistency(0.3, exact=True)", renderer="gsplat"))
 
 

@@ -66,13 +66,13 @@ def test_gradients_of_pearson(assert_gradients_of_differences):
 
 
 def test_arguments_and_priors(three_views, tiny_scene):
-    with pytest.raises(ValueError, match="weight must not be negative, got -1"):
+    with pytest.raises(ValueError, match=r"weight .*negative, got -1"):
         LOSSES.make("pearson(-1.0)")
     bare = dataclasses.replace(three_views[1], depth_prior=None)
     with pytest.raises(ValueError, match=r"\['b'\] lack.*--depth"):
         Pearson().begin(dataclasses.replace(tiny_scene, train=(three_views[0], bare)))
     metric = dataclasses.replace(bare, depth_prior=torch.tensor([[torch.nan, 750.0]]))
-    with pytest.raises(ValueError, match=r"prior of b reaches 750.*got 200.*offset=None"):
+    with pytest.raises(ValueError, match=r"b reaches 750.*200.*offset=None"):
         Pearson().begin(dataclasses.replace(tiny_scene, train=(three_views[0], metric)))
     Pearson(offset=None).begin(dataclasses.replace(tiny_scene, train=(three_views[0], metric)))
 

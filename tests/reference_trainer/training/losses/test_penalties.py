@@ -53,7 +53,7 @@ def test_arguments_and_photographs(three_views, tiny_scene):
         with pytest.raises(ValueError, match=message):
             LOSSES.make(text)
     opaque = dataclasses.replace(three_views[1], alpha=None)
-    with pytest.raises(ValueError, match=r"\['b'\] have no alpha.*dark"):
+    with pytest.raises(ValueError, match=r"\['b'\] .*no alpha.*dark"):
         Alpha().begin(dataclasses.replace(tiny_scene, train=(three_views[0], opaque)))
     Alpha(dark=0.1).begin(dataclasses.replace(tiny_scene, train=(opaque,)))
 

@@ -186,7 +186,7 @@ def test_wrong_variance(variance):
         lambda: ssim_map(image, image, variance),
         lambda: expected_photometric_loss(image, variance, image),
     ):
-        with pytest.raises(ValueError, match="variance must have shape, dtype and device of its image"):
+        with pytest.raises(ValueError, match=r"variance .*dtype and device"):
             function()
 
 

@@ -36,14 +36,14 @@ def test_a_schedule_decides_the_weight_of_each_step(take_step):
 def test_a_negative_weight_is_refused_at_its_step(take_step):
     (term,) = LOSSES.make("opacity(ramp(0.1, -0.1, 0, 10))")
     assert term(take_step(number=0)) > 0
-    with pytest.raises(ValueError, match=r"weight must not be negative, got -0\.1"):
+    with pytest.raises(ValueError, match=r"weight .*negative, got -0\.1"):
         term(take_step(number=10))
 
 
 def test_every_registered_term_takes_a_weight():
     for name in LOSSES:
         assert isinstance(LOSSES.make(name)[0], WeightedTerm)
-        with pytest.raises(ValueError, match="weight must not be negative"):
+        with pytest.raises(ValueError, match=r"weight .*negative"):
             LOSSES.make(f"{name}(weight=-1.0)")
 
 
@@ -56,13 +56,13 @@ def test_terms_look_at_the_photographs_before_the_first_step(tiny_scene):
 @pytest.mark.parametrize("name", list(LOSSES))
 def test_analytic_training_refuses_what_needs_a_draw_and_nothing_else(name):
     needs_one = name in {"pearson", "patch_depth", "warp", "smooth_depth", "alpha", "straight_through"}
-    with pytest.raises(ValueError, match="analytic training has no draw") if needs_one else nullcontext():
+    with pytest.raises(ValueError, match=r"analytic .*no draw") if needs_one else nullcontext():
         check(TrainConfig(dropout=0.2, analytic=True, models=2, loss=f"photometric + {name}"))
 
 
 @pytest.mark.parametrize("name", ["photometric", "views", "consistency", "straight_through", "co_regularization"])
 def test_a_weight_of_ssim_out_of_range_is_refused(name):
-    with pytest.raises(ValueError, match=r"lambda_dssim must lie in \[0, 1\], got 1\.5"):
+    with pytest.raises(ValueError, match=r"lambda_dssim .*\[0, 1\], got 1\.5"):
         LOSSES.make(f"{name}(lambda_dssim=1.5)")
 
 

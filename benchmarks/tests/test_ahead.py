@@ -15,7 +15,7 @@ from subprocesses import subprocess_environment
 
 pytest.importorskip("triton")
 pytest.importorskip("scipy")
-ROOT = Path(__file__).parents[4]
+ROOT = Path(__file__).parents[2]
 BOUNDS = json.loads((ROOT / "benchmarks" / "data" / "kernels.json").read_text("utf-8"))
 """Most registers and instructions per entry of every kernel by maker, as `python -m benchmarks.gpu ahead` printed them
 with Triton 3.9."""
@@ -34,7 +34,6 @@ def compiled(code):
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("target", ["sm_75", "sm_120", "gfx90a", "gfx1201"])
 def test_nothing_spills_or_takes_much_more_than_it_did(target):
     """The projections of one and two bands lie between those of none and of three, and took a quarter of the time."""
@@ -59,14 +58,12 @@ def test_the_table_of_the_page_has_the_numbers_of_the_bounds():
         assert most == [max(registers, same), nvidia, amd], name
 
 
-@pytest.mark.slow
 def test_a_spill_is_seen():
     """With fewer registers than the kernel needs."""
     kernel = "next(k for k in KERNELS if k.label == 'composite backward')"
     assert compiled(f"compile_ahead({kernel}, 'sm_90', maxnreg=24).spills") > 0
 
 
-@pytest.mark.slow
 def test_the_command_says_what_it_cannot_compile():
     done = run("-m", "benchmarks.gpu", "ahead", "sm_10")
     assert done.returncode == 1
