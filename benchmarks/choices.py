@@ -43,6 +43,7 @@ class Choice:
 _HIDDEN = "warp + hidden left out"
 _WARPS = ("warp", "warp + no smoothness", _HIDDEN, f"{_HIDDEN} + no smoothness")
 _RATES = ("means x4", "means x1/4", "means by pixels", "opacities x1/2", "scales x1/2", "colors x1/2")
+_NAMED = ("rate 0.1", "random background", "rate 0.35", "flat")
 _COUNTS = ("5,000 dense and few", "8,000 dense and few", "30,000 dense and few", "filled")
 CHOICES = {
     "third": Choice(("rate 0.3", "no reset", "threshold 3e-4"), seeds=(0,)),
@@ -51,6 +52,7 @@ CHOICES = {
     "sixth": Choice(_RATES, seeds=range(6)),
     "sixth, second round": Choice(_RATES, seeds=range(6), tried=(0, 1)),
     "seventh": Choice(_COUNTS, seeds=range(6), starts=True),
+    "eighth": Choice(_NAMED, seeds=range(6)),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
