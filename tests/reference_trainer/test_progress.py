@@ -25,7 +25,7 @@ def test_a_training_writes_little_where_no_terminal_shows_its_bar(terminal, monk
 def test_a_message_does_not_go_into_the_line_of_a_bar(monkeypatch, capsys):
     """The bar is wiped out for it, and drawn again below."""
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    with cli._log_shown(), progress_bar(total=3, bar_format="{n} of {total}") as bar:
+    with cli.log_shown(), progress_bar(total=3, bar_format="{n} of {total}") as bar:
         bar.update()
         bar.refresh()
         before = capsys.readouterr().err
