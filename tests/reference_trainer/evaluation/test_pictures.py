@@ -163,16 +163,16 @@ def test_a_label_wider_than_its_picture_is_not_cut():
 
 
 def test_a_strategy_has_one_color_in_every_figure(tmp_path):
-    drawn = []
+    colors = []
     for order in (["baseline", "dropout"], ["dropout/seed_1", "noise", "my run"]):
         for label in order:
             (tmp_path / label).mkdir(parents=True, exist_ok=True)
             (tmp_path / label / "ca.jsonl").write_text('{"step": 1, "ca/test": 0.002, "psnr/test": 20.0}\n')
         dynamics_figure({label: tmp_path / label for label in order}, tmp_path / "dynamics.png")
         with Image.open(tmp_path / "dynamics.png") as picture:
-            drawn.append({pixel for _, pixel in picture.convert("RGB").getcolors(picture.width * picture.height)})
+            colors.append({pixel for _, pixel in picture.convert("RGB").getcolors(picture.width * picture.height)})
     rgb = {name: tuple(bytes.fromhex(code[1:])) for name, code in STRATEGIES.items()}
-    assert [{name for name in rgb if rgb[name] in each} for each in drawn] == [
+    assert [{name for name in rgb if rgb[name] in each} for each in colors] == [
         {"baseline", "dropout"},
         {"dropout", "noise"},
     ]

@@ -87,8 +87,8 @@ def test_a_browser_shows_what_the_renderer_renders(turned, opened):
     runs, _ = turned
     found = [load_run_model(run) for run in runs]
     for number, view in enumerate(two_of_each(found[0][1])):
-        drawn = shown(opened, f"$('from').value = {number}; $('from').onchange()")
-        for (model, _), picture in zip(found, drawn, strict=True):
+        pictures = shown(opened, f"$('from').value = {number}; $('from').onchange()")
+        for (model, _), picture in zip(found, pictures, strict=True):
             assert_rendered(picture, model, view)
 
 
@@ -101,8 +101,8 @@ def test_a_browser_shows_the_heat_and_hides_what_co_adapts_most(turned, opened):
     low, high = (float(end) for end in data["ends"]["heat"])
     plain = shown(opened, "$('from').value = 0; $('from').onchange(); $('color').click()")
     for hidden in (0, 30):
-        drawn = shown(opened, f"$('heat').click(); $('hide').value = {hidden}")
-        for (model, _), picture, color in zip(found, drawn, plain, strict=True):
+        pictures = shown(opened, f"$('heat').click(); $('hide').value = {hidden}")
+        for (model, _), picture, color in zip(found, pictures, plain, strict=True):
             values = share_per_weight(mean_shares(model, views)[0], blend_weights(model, views))
             kept = values.argsort().argsort() < len(values) - len(values) * hidden // 100
             assert int(kept.sum()) == pytest.approx((1 - hidden / 100) * len(values), abs=1)
@@ -262,8 +262,8 @@ def test_curves_are_read_zoomed_and_toggled(turned, opened):
         assert opened.run(f"{button}.click(), {paths}") == [len(curves)] * 2
     colors = {run["label"]: run["color"] for run in Parsed(turned[1]).data["runs"]}
     assert [*colors.values()] == [STRATEGIES["noise"], STRATEGIES["both"]]
-    drawn = opened.run("[...charts[0].box.querySelectorAll('.curve')].map(path => path.getAttribute('stroke'))")
-    assert drawn == [colors[curve["run"]] for curve in curves]
+    plotted = opened.run("[...charts[0].box.querySelectorAll('.curve')].map(path => path.getAttribute('stroke'))")
+    assert plotted == [colors[curve["run"]] for curve in curves]
 
 
 @pytest.mark.slow

@@ -117,8 +117,8 @@ def test_the_views_come_with_their_pictures(pair):
         render = model.test_rendering(view).image
         for uri, expected in ((entry["photograph"], view.image), (entry["pictures"][1]["render"], render)):
             with Image.open(BytesIO(b64decode(uri.partition(",")[2]))) as file:
-                drawn = np.asarray(file).transpose(2, 0, 1) / 255
-            assert np.abs(drawn - expected.clamp(0, 1).numpy()).mean() < 0.02  # compressed
+                rendered = np.asarray(file).transpose(2, 0, 1) / 255
+            assert np.abs(rendered - expected.clamp(0, 1).numpy()).mean() < 0.02  # compressed
         expected = set() if entry["name"].startswith("train") else {"expected error"}
         assert set(entry["pictures"][1]) == {"render", "error", "co-adaptation", "caption"} | expected
 
@@ -228,8 +228,8 @@ def test_opacities_that_depend_on_the_camera_are_rendered_plain(tmp_path, option
     page = Parsed(write_report([tmp_path], views=1))
     assert "depend on the camera" in page.data["notes"][0]
     (packed,) = page.data["runs"]
-    drawn = np.sort(unpacked(packed)["opacities"][:, 0])
-    np.testing.assert_allclose(drawn, trainer.gaussians.opacities.detach().sort().values, atol=0.6 / 512)
+    shown = np.sort(unpacked(packed)["opacities"][:, 0])
+    np.testing.assert_allclose(shown, trainer.gaussians.opacities.detach().sort().values, atol=0.6 / 512)
 
 
 def test_what_is_no_run_or_no_pair_is_refused(run, found, tmp_path, monkeypatch):
