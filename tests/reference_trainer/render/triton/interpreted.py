@@ -4,6 +4,7 @@ Run by `test_interpreted.py` and, on a card, by `test_on_a_card.py`, in a proces
 is decided when it is imported. By hand: ``TRITON_INTERPRET=1 pytest -n0 -m "" FILE``.
 """
 
+import itertools
 import os
 from typing import NamedTuple
 
@@ -147,7 +148,7 @@ def leaves_of(engine, *tensors):
     use_engine("torch" if engine == "exact" else engine)
     device = DEVICE if engine == "triton" else torch.device("cpu")
     dtype = torch.float64 if engine == "exact" else torch.float32
-    return [x.to(device, torch.float32).to(dtype).clone().requires_grad_() for x in tensors]
+    return [x.detach().to(device, torch.float32).to(dtype).clone().requires_grad_() for x in tensors]
 
 
 def outcome(engine, s, w, render):
@@ -217,6 +218,91 @@ def test_images_are_those_of_brute_force(n):
     out = rasterize(splat(*leaves[:4], s.camera, colors=leaves[4]))
     for mine, exact in ((out.image, image), (out.alpha, alpha)):
         assert ((mine.detach().cpu() - exact) * safe).abs().max() <= 2e-5  # float32 coordinates against float64
+
+
+def six(engine):
+    """Six Gaussians and a background as an engine takes them, with a camera that float32 represents exactly."""
+    s = scene(6, 12, 8, seed=1, size=0.2).to(torch.float32).to(torch.float64)
+    *leaves, background = leaves_of(engine, *s.tensors(), BACKGROUND)
+    return s._replace(**dict(zip(s._fields, leaves, strict=False))), background
+
+
+def over_all_masks(s, background):
+    """Probabilities of the 64 masks given a rate, and brute force's pictures: RGB and alpha, (64, 4, H, W)."""
+    masks = torch.tensor([*itertools.product([0.0, 1.0], repeat=6)], dtype=torch.float64)
+    pictures = []
+    for mask in masks:
+        sums, alpha = brute_force(*s[:3], s.opacities * mask, s.colors, s.camera)
+        pictures.append(torch.cat([sums + (1 - alpha) * background[:, None, None], alpha[None]]))
+    assert pictures[-1][3].max() < 0.999  # moments know no early stop
+    return (
+        masks,
+        lambda rate: (masks * (1 - rate) + (1 - masks) * rate).prod(1)[:, None, None, None],
+        torch.stack(pictures),
+    )
+
+
+def as_issued(mine, exact):
+    """Within the goals: of pictures, and of gradients as a share of the largest."""
+    for name, (a, b) in {"picture": (mine.images, exact.images), "gradient": (mine.gradients, exact.gradients)}.items():
+        for x, y in zip(a, b, strict=True):
+            scale, tolerance = (max(1.0, y.abs().max()), IMAGE) if name == "picture" else (y.abs().max(), GRADIENT)
+            assert (x - y).abs().max() <= tolerance * scale, (name, (x - y).abs().max() / scale)
+
+
+@pytest.mark.slow
+def test_pictures_depth_and_gradients_of_six_are_those_of_brute_force():
+    s, background = six("exact")
+    w = weights(5, s)
+    depth = (s.means @ s.camera.world_to_camera[2, :3] + s.camera.world_to_camera[2, 3])[:, None]
+    sums, alpha = brute_force(*s[:4], torch.cat([s.colors, depth], 1), s.camera)
+    images = torch.cat([sums[:3] + (1 - alpha) * background[:, None, None], alpha[None], sums[3:]])
+    (images * w).sum().backward()
+    exact = Outcome([(images * (w != 0)).detach()], [x.grad for x in (*s.tensors(), background)])
+    mine = outcome("triton", s, w, plain)
+    as_issued(mine._replace(images=[mine.images[0] * (w != 0)]), exact)
+
+
+@pytest.mark.slow
+def test_moments_masks_and_shares_of_six_are_those_of_all_64_masks():
+    s, background = six("exact")
+    w = weights(7, s)
+    rate = torch.linspace(0.1, 0.7, 6, dtype=torch.float64, requires_grad=True)
+    masks, chance, pictures = over_all_masks(s, background)
+    mean = (chance(rate) * pictures).sum(0)
+    variance = (chance(rate) * (pictures - mean).square()).sum(0)[:3]
+    images = torch.cat([mean[:3], variance, mean[3:]])
+    (images * w).sum().backward()
+    exact = Outcome([(images * (w != 0)).detach()], [x.grad for x in (*s.tensors(), background, rate)])
+
+    def render(splats, background):
+        p = rate.detach().to(background).requires_grad_()
+        found = render_moments(splats, Multiplier(1 - p, p * (1 - p)), background=background)
+        return found, (p,)
+
+    mine = outcome("triton", s, w, render)
+    as_issued(mine._replace(images=[mine.images[0] * (w != 0)]), exact)
+
+    drawn, behind = six("triton")
+    with torch.no_grad():
+        splats = splat(*drawn[:4], s.camera, colors=drawn[4])
+        some = masks[::9].to(drawn.opacities)
+        colors, alphas = render_masks(splats, some * drawn.opacities, background=behind)
+        found = torch.cat([colors, alphas[:, None]], 1).cpu()
+        assert ((found - pictures[::9]) * (w[0] != 0)).abs().max() <= IMAGE
+        p, safe = rate.to(behind), (w[0] != 0).to(behind)
+        shares = variance_shares(splats, Multiplier(1 - p, p * (1 - p)), safe, background=behind)
+        # The share of one is the variance of the mean, given who is in front, that it adds to the mean without it.
+        order = (s.means @ s.camera.world_to_camera[2, :3]).argsort().tolist()
+        given = pictures[:, :3].reshape(*[2] * 6, 3, *safe.shape).permute(*order, 6, 7, 8)
+        for k, i in reversed([*enumerate(order)]):
+            dropped, kept = given.unbind(k)
+            share = rate[i] * (1 - rate[i]) * (kept - dropped).square()
+            given = rate[i] * dropped + (1 - rate[i]) * kept
+            for j in order[:k]:
+                share = rate[j] * share[0] + (1 - rate[j]) * share[1]
+            at = (splats.indices == i).nonzero()[:, 0]
+            assert abs(shares[at].sum() - (share.mean(0) * safe.cpu()).sum()) <= GRADIENT * shares.max()
 
 
 @pytest.mark.slow
