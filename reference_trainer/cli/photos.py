@@ -38,7 +38,17 @@ Step = Literal["photographs", "poses", "train", "evaluate", "report"]
 _WRITTEN: dict[Step, tuple[str, ...]] = {
     "photographs": (run.SCENE, MARK),
     "poses": (f"{run.SCENE}/*/sparse",),
-    "train": (run.CHECKPOINT, run.CONFIG, run.PLAN, run.PLY, run.BAKED_PLY, "ca.jsonl", "events.out.*"),
+    "train": (
+        run.CHECKPOINT,
+        run.CONFIG,
+        run.PLAN,
+        run.PLY,
+        run.BAKED_PLY,
+        run.GUARD,
+        run.GUARD_PICTURE,
+        "ca.jsonl",
+        "events.out.*",
+    ),
     "evaluate": (run.RESULTS, "evaluation.partial.json", run.VIEWS),
     "report": ("report.html",),
 }
