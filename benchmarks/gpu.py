@@ -265,7 +265,7 @@ def _agreement(device: str = "cuda") -> Iterator[str]:
         torch.use_deterministic_algorithms(before)
     changed = [name for name in one if not all(map(torch.equal, one[name], other[name]))]
     yield ""
-    yield (f"FAILED: deterministic runs differ in {', '.join(changed)}" if changed else "Deterministic runs agree.")
+    yield f"FAILED: deterministic runs differ in {', '.join(changed)}" if changed else "Deterministic runs agree."
 
 
 def _apart(found: Sequence[Tensor], exact: Sequence[Tensor]) -> str:

@@ -6,6 +6,7 @@ is decided when it is imported. By hand: ``TRITON_INTERPRET=1 pytest -n0 -m "" F
 
 import itertools
 import os
+from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
@@ -15,9 +16,15 @@ from torch import Tensor
 
 from ca_reg.functional import Multiplier
 from reference_trainer.camera import Camera
+from reference_trainer.evaluation import shares as shares_module
 from reference_trainer.render import rasterize, render_masks, render_moments, splat, use_engine, variance_shares
 from reference_trainer.render.constants import MIN_ALPHA, MIN_TRANSMITTANCE, TILE
 from reference_trainer.render.densification import absgrad_sink, splat_weights, with_absolute_gradients
+from reference_trainer.runs.run import model_of
+from reference_trainer.scenes import synthetic_scene
+from reference_trainer.scenes.virtual_cameras import unseen_views
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.trainer import Trainer
 
 DEVICE = torch.device("cpu" if os.environ.get("TRITON_INTERPRET") == "1" else "cuda")
 # What differs between a processor and a card is the rounding of division, square roots and exponentials.
@@ -421,6 +428,26 @@ def test_deterministic_gradients(render):
     for a, b, c in zip(ordered, by_atomics, again, strict=True):
         close(a, b, b, GRADIENT)
         assert torch.equal(a, c)
+
+
+@pytest.mark.slow
+def test_a_step_on_the_expectation_and_a_guard(monkeypatch):
+    """A guard of an opaque model at one camera; pixels at the cut of 1/255 are among them, hence the tolerances."""
+    monkeypatch.setattr(shares_module, "amid_views", lambda scene: [])
+    scene, found = synthetic_scene(width=12, height=9, points=30), []
+    for engine, device in (("triton", DEVICE), ("torch", "cpu")):
+        use_engine(engine)
+        trainer = Trainer(scene, TrainConfig(iterations=1, dropout=0.2, analytic=True), device)
+        trainer.train_step()
+        model = model_of(trainer)
+        opaque = replace(model.gaussians, opacity_logits=torch.full_like(model.gaussians.opacity_logits, 3.0))
+        guarded = shares_module.guard(replace(model, gaussians=opaque), scene, unseen_views(scene)[:1], rounds=1)
+        found.append((float(trainer.loss), guarded.keep.cpu(), guarded.scores))
+    (mine, kept, scores), (theirs, theirs_kept, theirs_scores) = found
+    assert mine == pytest.approx(theirs, rel=1e-3)
+    assert torch.equal(kept, theirs_kept)
+    assert scores == pytest.approx(theirs_scores, rel=1e-2)
+    assert scores[0] > 0
 
 
 def test_what_it_cannot_do_is_refused_by_name():
