@@ -6,6 +6,7 @@ is decided when it is imported. By hand: ``TRITON_INTERPRET=1 pytest -n0 -m "" F
 
 import itertools
 import os
+from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
@@ -18,6 +19,8 @@ from reference_trainer.camera import Camera
 from reference_trainer.render import rasterize, render_masks, render_moments, splat, use_engine, variance_shares
 from reference_trainer.render.constants import MIN_ALPHA, MIN_TRANSMITTANCE, TILE
 from reference_trainer.render.densification import absgrad_sink, splat_weights, with_absolute_gradients
+from reference_trainer.studies.stability.cases import all_cases
+from reference_trainer.studies.stability.stability_study import judge
 
 DEVICE = torch.device("cpu" if os.environ.get("TRITON_INTERPRET") == "1" else "cuda")
 # What differs between a processor and a card is the rounding of division, square roots and exponentials.
@@ -303,6 +306,24 @@ def test_moments_masks_and_shares_of_six_are_those_of_all_64_masks():
                 share = rate[j] * share[0] + (1 - rate[j]) * share[1]
             at = (splats.indices == i).nonzero()[:, 0]
             assert abs(shares[at].sum() - (share.mean(0) * safe.cpu()).sum()) <= GRADIENT * shares.max()
+
+
+# Of the stability study, what pushes the geometry and takes the interpreter seconds.
+EXTREMES = {
+    f"{case.family}: {case.name}": number
+    for number, case in enumerate(all_cases())
+    if case.family in ("shape and size", "place", "camera and image") and "4096" not in case.name
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EXTREMES)
+def test_the_far_end_of_the_stability_study(name):
+    case = all_cases()[EXTREMES[name]]
+    far = max(x for x in case.magnitudes if x <= case.until)
+    use_engine("triton")
+    record = judge(replace(case, magnitudes=(far,)))
+    assert record["ending"] == "ok", record["points"]
 
 
 @pytest.mark.slow
