@@ -62,7 +62,8 @@ class IndependentDropout(Regularizer):
         if is_zero(rates):
             return Draw()
         draw = keep_mask if self.bounded else functional.draw_keep_mask
-        return Draw(keep=draw(len(x.opacities), rates, generator=generator, device=x.opacities.device))
+        count, device = x.opacities.shape[0], x.opacities.device
+        return Draw(keep=draw(count, rates, generator=generator, device=device))
 
     def replay(self, x: Params, draw: Draw) -> Params:
         """Set the opacities of dropped Gaussians to 0; if asked to, compensate the others for the rates of ``x``."""

@@ -92,10 +92,11 @@ def engine_for(device: torch.device, dtype: torch.dtype = torch.float32) -> Engi
 
 
 def engines_on(device: torch.device) -> tuple[str, ...]:
-    """Return the engines that render float32 on a device; "numba" only on a CPU, "triton" on a card."""
-    if _runs_triton(device, "auto") and _compiled_engine("triton") is not None:
-        return ("triton", "torch")
-    return ("numba", "torch") if device.type == "cpu" and _compiled_engine("numba") is not None else ("torch",)
+    """Return the engines that render float32 on a device; "numba" only on a CPU, "triton" on a card or interpreted."""
+    found = ["triton"] if _runs_triton(device, "triton") and _compiled_engine("triton") is not None else []
+    if device.type == "cpu" and _compiled_engine("numba") is not None:
+        found.append("numba")
+    return (*found, "torch")
 
 
 @contextmanager

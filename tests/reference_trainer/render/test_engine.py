@@ -135,9 +135,13 @@ def test_an_engine_that_is_not_there_changes_nothing(monkeypatch):
     assert os.environ["CA_REG_ENGINE"] == "torch"
 
 
-def test_loops_render_on_a_cpu_alone():
+def test_loops_render_on_a_cpu_alone(monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     assert engines_on(torch.device("cpu")) == ("numba", "torch")
-    assert engines_on(torch.device("cuda")) == (("triton", "torch") if find_spec("triton") else ("torch",))
+    kernels = ("triton",) if find_spec("triton") else ()
+    assert engines_on(torch.device("cuda")) == (*kernels, "torch")
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    assert engines_on(torch.device("cpu")) == (*kernels, "numba", "torch")
 
 
 def test_triton_renders_float32_on_a_card_and_if_interpreted_on_a_cpu(monkeypatch):

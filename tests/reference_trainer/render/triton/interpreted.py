@@ -23,6 +23,8 @@ from reference_trainer.render.densification import absgrad_sink, splat_weights, 
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.virtual_cameras import unseen_views
+from reference_trainer.studies.stability.cases import all_cases
+from reference_trainer.studies.stability.stability_study import judge
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
 
@@ -310,6 +312,24 @@ def test_moments_masks_and_shares_of_six_are_those_of_all_64_masks():
                 share = rate[j] * share[0] + (1 - rate[j]) * share[1]
             at = (splats.indices == i).nonzero()[:, 0]
             assert abs(shares[at].sum() - (share.mean(0) * safe.cpu()).sum()) <= GRADIENT * shares.max()
+
+
+# Of the stability study, what pushes the geometry and takes the interpreter seconds.
+EXTREMES = {
+    f"{case.family}: {case.name}": number
+    for number, case in enumerate(all_cases())
+    if case.family in ("shape and size", "place", "camera and image") and "4096" not in case.name
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EXTREMES)
+def test_the_far_end_of_the_stability_study(name):
+    case = all_cases()[EXTREMES[name]]
+    far = max(x for x in case.magnitudes if x <= case.until)
+    use_engine("triton")
+    record = judge(replace(case, magnitudes=(far,)))
+    assert record["ending"] == "ok", record["points"]
 
 
 @pytest.mark.slow

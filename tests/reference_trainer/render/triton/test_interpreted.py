@@ -28,9 +28,9 @@ def passes(marked, interpret, name="interpreted.py", *, named=""):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("marked", ["not slow", "slow"])
-def test_in_the_interpreter(marked):
-    passes(marked, "1")
+@pytest.mark.parametrize(("marked", "named"), [("not slow", ""), ("slow", "not far_end"), ("slow", "far_end")])
+def test_in_the_interpreter(marked, named):
+    passes(marked, "1", named=named)
 
 
 @pytest.mark.slow
