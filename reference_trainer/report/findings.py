@@ -163,8 +163,8 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Colle
         expected = None if own else errors(view, view.mask if isinstance(view, View) else None)
         pictures.append(pictures_of(model, view, expected, result))
     unseen, hangs, removed, veils = [], None, removed_from(run), dict[str, str]()
-    if removed and (picture := run / GUARD_PICTURE).exists():
-        veils["what the guard removed"] = image_uri(read_image(picture)[0])
+    if removed and (shown := run / GUARD_PICTURE).exists():
+        veils["what the guard removed"] = image_uri(read_image(shown)[0])
     if len(scene.train) > 1:
         places = unseen_views(scene)
         places = [places[i].to(device) for i in evenly_spaced(len(places), min(MOST_UNSEEN, len(places)))]

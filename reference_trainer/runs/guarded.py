@@ -39,12 +39,12 @@ def log_what_hangs(model: TrainedModel, scene: Scene | None, out: Path) -> None:
         return
     with threads_for(scene.pixels):
         found = guard(model, scene)
-        picture = hanging_picture(model, scene, found) if found.where else None
+        image = hanging_picture(model, scene, found) if found.where else None
     _log.info("%s%s", found, " To remove them: ca-reg clean PLY --hanging --scene FOLDER." if found.where else "")
     if not is_own_png(path := out / HANGING):
         _log.info("%s is not from here, and is kept: there is no picture of what hangs.", path)
-    elif picture is not None:
-        save_png(path, picture)
+    elif image is not None:
+        save_png(path, image)
         _log.info("How that looks is in %s", path)
     else:  # of an earlier model
         path.unlink(missing_ok=True)

@@ -84,9 +84,9 @@ def decode_image(path: str | Path) -> Any:
         return file.convert("RGBA" if has_alpha(file) else "RGB")
 
 
-def has_alpha(picture: Any) -> bool:
+def has_alpha(image: Any) -> bool:
     """Whether a Pillow image has transparency."""
-    return picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
+    return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
 
 
 def image_size(path: str | Path) -> tuple[int, int]:

@@ -180,7 +180,7 @@ def test_photographs_that_cannot_be_read_are_left_out_and_all_are_named(noise, t
 def test_what_was_left_out_is_kept_beside_the_model(noise, monkeypatch):
     placed = reconstruction()
     placed.images.pop(2)
-    monkeypatch.setattr(poses, "_reconstruct", lambda *_: placed)
+    monkeypatch.setattr(poses, "reconstruct", lambda *_: placed)
     cut_off(noise / "3.jpg")
     said = str(find_poses(noise)).splitlines()
     assert said[2].startswith("left out: 2.png. ")
@@ -191,7 +191,7 @@ def test_what_was_left_out_is_kept_beside_the_model(noise, monkeypatch):
 
 def test_photographs_beside_an_empty_folder_images_are_found(noise, monkeypatch):
     (noise / "images").mkdir()
-    monkeypatch.setattr(poses, "_reconstruct", lambda *_: reconstruction())
+    monkeypatch.setattr(poses, "reconstruct", lambda *_: reconstruction())
     assert find_poses(noise).registered == ("0.png", "1.png", "2.png")
     assert image_folder(noise, None) == noise  # where a training looks for them
 
