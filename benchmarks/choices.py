@@ -53,6 +53,7 @@ CHOICES = {
     "sixth, second round": Choice(_RATES, seeds=range(6), tried=(0, 1)),
     "seventh": Choice(_COUNTS, seeds=range(6), starts=True),
     "eighth": Choice(_NAMED, seeds=range(6)),
+    "eighth, second round": Choice(_NAMED, seeds=range(6), tried=(0, 1)),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""

@@ -234,6 +234,7 @@ def zigzag(count: int) -> Scene:
     return scene
 
 
+@pytest.mark.slow
 def test_what_hangs_at_one_of_many_places_is_found(monkeypatch):
     """Amid three cameras, off the ways between them, where the mean over all places hardly knows of it."""
     scene = zigzag(11)

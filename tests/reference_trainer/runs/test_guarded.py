@@ -35,6 +35,7 @@ def veiled(run):
     return dataclasses.replace(model, gaussians=Gaussians.from_named(both)), scene
 
 
+@pytest.mark.slow
 def test_it_is_shown_where_it_changes_the_picture_most(veiled):
     model, scene = veiled
     found = guard(model, scene)
@@ -51,6 +52,7 @@ def test_it_is_shown_where_it_changes_the_picture_most(veiled):
         where_it_shows(rest, scene, guard(rest, scene))
 
 
+@pytest.mark.slow
 def test_what_hangs_is_said_and_shown_beside_the_scores(veiled, tmp_path, said):
     model, scene = veiled
     log_what_hangs(model, scene, tmp_path)

@@ -303,6 +303,7 @@ def test_of_many_photographs_a_dense_start_must_be_asked_for(tmp_path, cache, ph
     assert not cache.exists()
 
 
+@pytest.mark.slow
 def test_of_sixteen_photographs_it_takes_the_place_of_random_points(tmp_path, cache):
     written(tmp_path / "scene", plane(*np.linspace(-0.5, 0.5, 16).tolist()))
     few_points(tmp_path / "scene", 99)
