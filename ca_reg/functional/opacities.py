@@ -99,7 +99,12 @@ def apply_dropout(opacity: Tensor, keep: Tensor, *, p: Rate = 0.0, compensate: b
         raise TypeError(f"keep must be a bool tensor, got {keep.dtype}; compare with a threshold to get a mask.")
     # Not a product: 0 * inf and 0 * nan would put nan where Gaussians are dropped, forward and backward.
     masked = opacity.masked_fill(~keep.view_as(opacity), 0.0)
-    return masked * (1.0 / (1.0 - rate_like(p, opacity))) if compensate else masked
+    return compensated(masked, p) if compensate else masked
+
+
+def compensated(opacity: Tensor, p: Rate) -> Tensor:
+    """Multiply survivors by ``1 / (1 - p)``, at rates that are known to be in [0, 1): reading them waits for a card."""
+    return opacity * (1.0 / (1.0 - rate_like(p, opacity)))
 
 
 def gaussian_dropout(

@@ -7,7 +7,7 @@ import torch
 from ca_reg import functional
 from ca_reg._check import Rate, check_rate, is_zero, rate_like
 from ca_reg.functional import Multiplier
-from ca_reg.functional.opacities import keep_mask
+from ca_reg.functional.opacities import compensated, keep_mask
 from ca_reg.regularizer import Draw, Params, Regularizer
 from ca_reg.schedules import LinearRamp, Schedule
 
@@ -71,7 +71,7 @@ class IndependentDropout(Regularizer):
             return x
         opacities = functional.apply_dropout(x.opacities, draw.keep)
         if self.compensate:  # which alone needs the rates again; some are the ranks of a whole model
-            opacities = opacities * (1.0 / (1.0 - rate_like(self.rates(x), x.opacities)))
+            opacities = compensated(opacities, self.rates(x))
         return x._replace(opacities=opacities)
 
     def expected(self, x: Params) -> Params:

@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +13,7 @@ import pytest
 import torch
 from launched import draws, launch, seen
 from stand_ins.inria import Model, make_rasterizer, make_render
+from veils import veiled_at
 
 from ca_reg import Chain
 from ca_reg.integrations._scripts import find_script
@@ -21,7 +21,6 @@ from ca_reg.integrations.gsplat import Installation
 from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.integrations.run import main, parse_options
 from reference_trainer.evaluation.pictures import save_png
-from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
 from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.scene import Scene
@@ -376,16 +375,8 @@ def test_a_guarded_model_is_written_again_without_what_hangs(repository, tmp_pat
     scene, work = synthetic_scene(width=48, height=36, points=400), tmp_path / "work"
     write_scene(tmp_path / "scene", scene)
     start = initial_gaussians(scene, TrainConfig())
-    start = replace(start, opacity_logits=start.opacity_logits + 3)
     beyond = [view.camera for view in unseen_views(scene) if view.name.startswith("beyond train_0")]
-    veil = replace(
-        start[: len(beyond)],
-        means=torch.stack([camera.position + 0.4 * camera.forward for camera in beyond]),
-        log_scales=torch.full((len(beyond), 3), -2.5),
-        opacity_logits=torch.full((len(beyond),), 6.0),
-    )
-    named = dict(veil.named())
-    both = Gaussians.from_named({name: torch.cat([x, named[name]]) for name, x in start.named()})
+    both, veil = veiled_at(beyond, start, more=3.0)
     save_ply(both, tmp_path / "trained.ply")
     script, trained = repository / "train.py", str(tmp_path / "trained.ply")
     saves = f"""    for name in ("first.ply", "last.ply"):

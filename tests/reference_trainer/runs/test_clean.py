@@ -2,9 +2,9 @@ import dataclasses
 
 import pytest
 import torch
+from veils import veiled_at
 
 from reference_trainer.evaluation.shares import blend_weights, guard, mean_shares, share_per_weight
-from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
 from reference_trainer.runs import edit_ply
 from reference_trainer.runs.edit_ply import clean_ply, refined
@@ -104,15 +104,7 @@ def test_what_hangs_goes_and_nothing_else(run, options, tmp_path, said):
     """A model that the guard finds something in: opaque Gaussians close before cameras beside the training cameras."""
     model, scene = load_run_model(run[0])
     views = [view.camera for view in unseen_views(scene) if view.name.startswith(("beyond train_0", "beyond train_2"))]
-    veil = model.gaussians[: len(views)]
-    veil = dataclasses.replace(
-        veil,
-        means=torch.stack([camera.position + 0.4 * camera.forward for camera in views]),
-        log_scales=torch.full_like(veil.log_scales, -2.5),
-        opacity_logits=torch.full_like(veil.opacity_logits, 5.0),
-    )
-    both = {name: torch.cat([x, dict(veil.named())[name]]) for name, x in model.gaussians.named()}
-    opaque = dataclasses.replace(Gaussians.from_named(both), opacity_logits=both["opacity_logits"] + 4)
+    opaque, veil = veiled_at(views, model.gaussians)
     save_ply(opaque, tmp_path / "veiled.ply", regularizer="dropout(0.2)")
     found = clean_ply(tmp_path / "veiled.ply", options, tmp_path / "c.ply", hanging=True)
     assert list(found) == ["as it was", "taken out"]  # it leaves no holes to be closed

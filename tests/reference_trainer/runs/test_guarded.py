@@ -4,11 +4,11 @@ import json
 import pytest
 import torch
 from reports import Parsed
+from veils import veiled_at
 
 from reference_trainer.cli import main
 from reference_trainer.evaluation.pictures import is_own_png
 from reference_trainer.evaluation.shares import guard, where_it_shows
-from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply, save_ply
 from reference_trainer.report.page import write_report
 from reference_trainer.runs.folder import GUARD, GUARD_PICTURE
@@ -23,16 +23,7 @@ def veiled(run):
     """A model with opaque Gaussians close before a camera beyond the training cameras, and its scene."""
     model, scene = load_run_model(run[0])
     cameras = [view.camera for view in unseen_views(scene) if view.name.startswith("beyond train_0")]
-    veil = model.gaussians[: len(cameras)]
-    veil = dataclasses.replace(
-        veil,
-        means=torch.stack([camera.position + 0.4 * camera.forward for camera in cameras]),
-        log_scales=torch.full_like(veil.log_scales, -2.5),
-        opacity_logits=torch.full_like(veil.opacity_logits, 5.0),
-    )
-    both = {name: torch.cat([x, dict(veil.named())[name]]) for name, x in model.gaussians.named()}
-    both["opacity_logits"] = both["opacity_logits"] + 4
-    return dataclasses.replace(model, gaussians=Gaussians.from_named(both)), scene
+    return dataclasses.replace(model, gaussians=veiled_at(cameras, model.gaussians)[0]), scene
 
 
 @pytest.mark.slow
