@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ._calls import RasterizerCall, Signature, class_in, forward_signature
+from ._calls import RasterizerCall, Signature, class_in, forward_signature, rasterizer_classes
 
 
 class AfterImport(MetaPathFinder):
@@ -246,6 +246,27 @@ def override(rasterizers: Sequence[type], opacity: Tensor) -> Iterator[list[Rast
             undo.enter_context(_patched(rasterizer))
         undo.callback(_current.reset, _current.set(mine))
         yield mine.calls
+
+
+@contextmanager
+def rendered_once(
+    render: Callable[[], Any], opacity: Tensor, rasterizer: type | None
+) -> Iterator[tuple[Any, RasterizerCall]]:
+    """Render with other opacities; yield what ``render`` returned and its only call of the rasterizer.
+
+    Within the block the call may be made again. ``rasterizer`` is the class, None for the installed ones. Errors are
+    those of :func:`ca_reg.integrations.inria.render_fn`.
+    """
+    rasterizers = rasterizer_classes() if rasterizer is None else [rasterizer]
+    with override(rasterizers, opacity) as calls:
+        returned = render()
+        if len(calls) != 1:
+            names = ", ".join(rasterizer.__qualname__ for rasterizer in rasterizers)
+            raise RuntimeError(
+                f"render called {names} {len(calls)} times, expected once; pass the class it uses as "
+                "rasterizer=..., and a render function that makes one picture."
+            )
+        yield returned, calls[0]
 
 
 @contextmanager

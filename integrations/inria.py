@@ -27,11 +27,10 @@ from ._calls import (
     chain_of,
     find_installed,
     hide_dropped,
-    rasterizer_classes,
     second_regularizers,
     white_alpha,
 )
-from ._patching import PatchedClasses, is_overridden, override
+from ._patching import PatchedClasses, is_overridden, rendered_once
 from ._report import Hook, Skip
 from ._steps import Iterations, ModelSteps, Steps, leaf_of
 
@@ -338,15 +337,8 @@ def render_fn(
     """
 
     def overridden(opacity: Tensor, view: Any) -> Rendering:
-        rasterizers = rasterizer_classes() if rasterizer is None else [rasterizer]
-        with override(rasterizers, opacity) as calls:
-            image, alpha = read_rendering(render(view, gaussians, pipe, background))
-            if len(calls) != 1:
-                names = ", ".join(rasterizer.__qualname__ for rasterizer in rasterizers)
-                raise RuntimeError(
-                    f"render called {names} {len(calls)} times, expected once; pass the class it uses as "
-                    "rasterizer=..., and a render function that makes one picture."
-                )
-            return Rendering(image, white_alpha(calls[0]) if alpha is None else alpha)
+        with rendered_once(lambda: render(view, gaussians, pipe, background), opacity, rasterizer) as (returned, call):
+            image, alpha = read_rendering(returned)
+            return Rendering(image, white_alpha(call) if alpha is None else alpha)
 
     return overridden
