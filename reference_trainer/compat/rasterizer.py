@@ -19,8 +19,12 @@ from reference_trainer.model.gaussians import compute_relocation
 from reference_trainer.render import rasterize, splat
 from reference_trainer.render.constants import DILATION
 from reference_trainer.render.densification import in_front, splat_weights, visible_radii, with_absolute_gradients
+from reference_trainer.render.splats import Splats
 
-__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "camera_of", "rasterizer_module"]
+__all__ = [
+    "GaussianRasterizationSettings", "GaussianRasterizer", "axes_of", "camera_of", "rasterizer_module", "splats_of",
+    "warn_of_ignored",
+]  # fmt: skip
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -69,6 +73,11 @@ class GaussianRasterizationSettings(_Fields):
         further = {name: fields.pop(name) for name in fields.keys() - set(cls._fields)}
         warn_of_ignored("setting", further)
         return super().__new__(cls, *values, **fields)
+
+    @property
+    def blur(self) -> float:
+        """By which splats are blurred, square pixels."""
+        return DILATION if self.kernel_size is None else float(self.kernel_size)
 
 
 def warn_of_ignored(kind: str, values: dict[str, Any]) -> None:
@@ -133,6 +142,32 @@ FLOOR = 2.5e-5  # least ratio of determinants in INRIA's antialiasing
 FLOOR_OF_MIP = 1e-6  # the same in Mip-Splatting
 
 
+def axes_of(
+    settings: GaussianRasterizationSettings, scales: Tensor | None, rotations: Tensor | None, covariances: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Return standard deviations (N, 3), those of surfels with a third of 0, and rotations; refuse covariances."""
+    if covariances is not None or scales is None or rotations is None:
+        raise ValueError(
+            "the stand-in rasterizer needs scales and rotations, and no cov3D_precomp: the eigenvectors of a "
+            "covariance have no gradient where two axes are equal. Go without --compute_cov3D_python "
+            "(pipe.compute_cov3D_python = False)."
+        )
+    lengths = torch.nn.functional.pad(scales, (0, 3 - scales.shape[1]))
+    return lengths * settings.scale_modifier, rotations
+
+
+def splats_of(
+    settings: GaussianRasterizationSettings, means: Tensor, rotations: Tensor, scales: Tensor, opacities: Tensor,
+    camera: Camera, *, sh: Tensor | None, colors: Tensor | None,
+) -> Splats:  # fmt: skip
+    """Project Gaussians with the blur and the antialiasing of the settings; arguments and errors as of `splat`."""
+    splats = splat(means, rotations, scales, opacities, camera, sh=sh, sh_degree=settings.sh_degree, colors=colors)
+    if settings.antialiasing or settings.kernel_size is not None:
+        floor = FLOOR if settings.antialiasing else FLOOR_OF_MIP
+        splats = filtered(splats, means, rotations, scales, camera, blur=settings.blur, floor=floor)
+    return splats
+
+
 def _without_autocast(method: F) -> F:
     """Let a method of a rasterizer compute in the precision of its arguments, as CUDA code does."""
 
@@ -175,7 +210,7 @@ class GaussianRasterizer(nn.Module):
         self, means3D: Tensor, scales: Tensor, rotations: Tensor, cov3D_precomp: Tensor | None = None
     ) -> Tensor:
         """Return the radii of Gaussians, as `forward` does, without rendering them (Scaffold-GS)."""
-        scales, rotations = self._axes(scales, rotations, cov3D_precomp)
+        scales, rotations = axes_of(self.raster_settings, scales, rotations, cov3D_precomp)
         return visible_radii(means3D, rotations, scales, camera_of(self.raster_settings))
 
     @_without_autocast
@@ -230,7 +265,7 @@ class GaussianRasterizer(nn.Module):
                 f"means2D of {type(self).__module__} must have shape ({len(means3D)}, 3), or 4 columns for sums of "
                 f"absolute gradients, got {tuple(means2D.shape)}."
             )
-        scales, rotations = self._axes(scales, rotations, cov3D_precomp)
+        scales, rotations = axes_of(settings, scales, rotations, cov3D_precomp)
         if dc is not None and shs is not None:
             shs = torch.cat([dc, shs], dim=1)
         camera = camera_of(settings)
@@ -240,13 +275,7 @@ class GaussianRasterizer(nn.Module):
             opacities = _weighted(opacities.reshape(n, 1), weight)
             shs = None if shs is None else _weighted(shs, weight[:, None])
             colors_precomp = None if colors_precomp is None else _weighted(colors_precomp, weight)
-        splats = splat(
-            means3D, rotations, scales, opacities, camera, sh=shs, sh_degree=settings.sh_degree, colors=colors_precomp
-        )
-        blur = DILATION if settings.kernel_size is None else float(settings.kernel_size)
-        if settings.antialiasing or settings.kernel_size is not None:
-            floor = FLOOR if settings.antialiasing else FLOOR_OF_MIP
-            splats = filtered(splats, means3D, rotations, scales, camera, blur=blur, floor=floor)
+        splats = splats_of(settings, means3D, rotations, scales, opacities, camera, sh=shs, colors=colors_precomp)
         # Pixels per unit of normalized device coordinates, for every column.
         half = [0.5 * camera.width, 0.5 * camera.height, 0.5 * camera.width, 0.5 * camera.height]
         sink = means2D.index_select(0, splats.indices) * means2D.new_tensor(half[:columns])
@@ -279,7 +308,7 @@ class GaussianRasterizer(nn.Module):
         if surfaces:
             found |= surface_planes(rendering._replace(splats=splats), means3D, rotations, scales, camera)
         covered = rendering.alpha.detach() > 0
-        found["radii"] = visible_radii(means3D, rotations, scales, camera, blur=blur)
+        found["radii"] = visible_radii(means3D, rotations, scales, camera, blur=settings.blur)
         if settings.pixel_weights is not None or "pixels" in parts:
             image = rendering.alpha if settings.pixel_weights is None else settings.pixel_weights
             table = torch.stack([*contributions(splats, image.reshape(covered.shape)), projection.depths.detach()])
@@ -296,18 +325,6 @@ class GaussianRasterizer(nn.Module):
             found |= {"heaviest": index[None].int(), "largest_weight": weight[None]}
         labels = (*(names or kinds), "radii")  # for a caller that names only one value
         return tuple(_output(kind, label, found, covered) for kind, label in zip(kinds, labels, strict=False))
-
-    def _axes(
-        self, scales: Tensor | None, rotations: Tensor | None, covariances: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Return standard deviations (N, 3), those of surfels with a third of 0, and rotations; refuse covariances."""
-        if covariances is not None or scales is None or rotations is None:
-            raise ValueError(
-                "the stand-in rasterizer needs scales and rotations, and no cov3D_precomp: the eigenvectors of a "
-                "covariance have no gradient where two axes are equal. Train without --compute_cov3D_python."
-            )
-        lengths = torch.nn.functional.pad(scales, (0, 3 - scales.shape[1]))
-        return lengths * self.raster_settings.scale_modifier, rotations
 
 
 def _output(kind: str | None, label: str | None, found: dict[str, Tensor], covered: Tensor) -> Tensor | Unknown:

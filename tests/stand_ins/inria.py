@@ -125,15 +125,19 @@ class Model:
 
 
 def settings_of(camera: Camera, background: Tensor) -> Settings:
+    tangents = camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)
+    projection = camera.world_to_camera.new_zeros(4, 4)  # of row vectors
+    for row, column, value in ((0, 0, 1 / tangents[0]), (1, 1, 1 / tangents[1]), (2, 2, 1), (2, 3, 1), (3, 2, -0.01)):
+        projection[row, column] = value
     return Settings(
         image_height=camera.height,
         image_width=camera.width,
-        tanfovx=camera.width / (2 * camera.fx),
-        tanfovy=camera.height / (2 * camera.fy),
+        tanfovx=tangents[0],
+        tanfovy=tangents[1],
         bg=background,
         scale_modifier=1.0,
         viewmatrix=camera.world_to_camera.T,
-        projmatrix=torch.eye(4, device=background.device),
+        projmatrix=camera.world_to_camera.T @ projection,
         sh_degree=0,
         campos=torch.zeros(3, device=background.device),
         prefiltered=False,
