@@ -32,9 +32,9 @@ TARGETS = {f"sm_{x}": GPUTarget("cuda", x, 32) for x in (75, 80, 86, 89, 90, 100
 TARGETS |= {f"gfx{x}": GPUTarget("hip", f"gfx{x}", 64 if x[0] == "9" else 32) for x in ("90a", "942", "1100", "1201")}
 
 # Types by the names of the arguments, which are the same in all kernels; the others are float32 numbers in memory.
-_TYPES = {name: "*i32" for name in ("starts", "gaussians", "counts")}
+_TYPES = {name: "*i32" for name in ("starts", "gaussians", "counts", "visible", "places")}
 _TYPES |= {"indices": "*i64", "order": "*i64", "ends": "*i64", "keys": "*i16", "numbers": "*fp64"}
-_TYPES |= {name: "*u8" for name in ("touched", "visible")}
+_TYPES |= {"touched": "*u8"}
 _TYPES |= {name: "i32" for name in ("first", "count", "width", "height", "columns", "listing")}
 _TYPES |= {name: "i32" for name in ("stride", "absolute_stride", *(f"count{i}" for i in range(6)))}
 _TYPES |= {f"row_{name}": "i32" for name in ("centers", "factors", "depths", "colors", "opacities")}
@@ -47,7 +47,7 @@ _TYPES |= {f"rate{i}": "fp32" for i in range(6)}
 class Kernel:
     """A kernel with the constants and warps of one of its uses; ``walks`` whether it walks over lists.
 
-    ``types`` are those of arguments that differ from use to use.
+    ``types`` are those of arguments that differ from use to use, ``registers`` the most on NVIDIA's cards.
     """
 
     label: str
@@ -56,6 +56,7 @@ class Kernel:
     warps: int = 1
     walks: bool = True
     types: Mapping[str, str] = field(default_factory=dict)
+    registers: int | None = None
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,8 @@ class Compiled:
 
 
 def _tiled(label: str, function: Any, columns: int, tile: int = 8, warps: int = 1, **constants: Any) -> Kernel:
-    return Kernel(label, function, {"STRIDE": columns, "TILE": tile, **constants}, warps)
+    registers = 64 if warps > 4 else None  # see `over_tiles`
+    return Kernel(label, function, {"STRIDE": columns, "TILE": tile, **constants}, warps, registers=registers)
 
 
 def _projection(bands: int) -> list[Kernel]:
@@ -109,6 +111,7 @@ def _carried(label: str, depth: bool, absolute: bool) -> list[Kernel]:
 _LISTING = {"TILE": 8, "GROUP": 32, "LANES": 8}
 KERNELS = [
     Kernel("find visible", projection.find_visible, {"BLOCK": 1024}, 4, walks=False),
+    Kernel("index visible", projection.index_visible, {"BLOCK": 1024}, 4, walks=False),
     *(kernel for bands in (0, 1, 4, 9, 16) for kernel in _projection(bands)),
     *(Kernel(f"fill table, {x} more", tiles.fill_table, {"MORE": x, "BLOCK": 256}, 4, walks=False) for x in (0, 1, 2)),
     Kernel("list tiles", binning.list_tiles, _LISTING, walks=False),
@@ -146,6 +149,8 @@ def compile_ahead(kernel: Kernel, target: str, **options: Any) -> Compiled:
     types = _TYPES | dict.fromkeys(kernel.constants, "constexpr") | kernel.types
     signature = {name: types.get(name, "*fp32") for name in names}
     options = {"num_warps": kernel.warps, "enable_fp_fusion": True} | options
+    if kernel.registers is not None and TARGETS[target].backend == "cuda":
+        options = {"maxnreg": kernel.registers} | options
     source = ASTSource(fn=kernel.function, signature=signature, constexprs=kernel.constants)
     code = triton.compile(source, target=TARGETS[target], options=options).asm
     registers, shared, spills, rows = measure_nvidia(code["cubin"]) if "cubin" in code else _measure_amd(code["amdgcn"])

@@ -223,7 +223,7 @@ def count_exact_score(count: int, width: int, scale: float, device: torch.device
 
     def rendering() -> Any:
         projected = splats.engine.project(inputs, model.camera, None)
-        lists = splats.engine.bin(projected, width, width, lambda numbers: None)
+        lists = splats.engine.bin(projected, width, width)
         return splats.engine.moments(Splats(*projected[:4], lists, splats.engine), multiplier, background)
 
     operations, mode, _ = counted(score)
@@ -269,7 +269,7 @@ def bytes_per_entry(device: torch.device | str = "cpu") -> float:
         inputs = dict(zip(("means", "quaternions", "scales", "opacities", "colors"), model.tensors, strict=True))
         engine = engine_for(torch.device(device))
         projected = engine.project(inputs, model.camera, None)
-        _, mode, lists = counted(partial(engine.bin, projected, 64, 64, lambda numbers: None))
+        _, mode, lists = counted(partial(engine.bin, projected, 64, 64))
         peaks.append(mode.peak)
         entries.append(len(lists.gaussians))
     return (peaks[1] - peaks[0]) / (entries[1] - entries[0])

@@ -7,7 +7,7 @@ camera, and is culled.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import Mapping, MutableMapping
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from reference_trainer.render.constants import MAX_ROUNDING
 from reference_trainer.render.splats import Projected, Projection, Splats
 
 __all__ = [
-    "NotFiniteError", "add_background", "check_projection", "checked_background", "checked_colors", "numbers_to_check"
+    "NotFiniteError", "check_projection", "checked_background", "checked_colors", "new_background", "numbers_to_check"
 ]  # fmt: skip
 
 _finite: MutableMapping[Tensor, int | None] = WeakIdKeyDictionary()
@@ -31,29 +31,32 @@ class NotFiniteError(ValueError):
 
 @torch.no_grad()
 def numbers_to_check(
-    depths: Tensor, opacities: Tensor, projection: Projection, colors: Tensor, camera: Camera
-) -> Tensor:
+    depths: Tensor, opacities: Tensor, projection: Projection, colors: Tensor, camera: Camera,
+    background: Tensor | None,
+) -> Tensor:  # fmt: skip
     """Return the sum of the projected depths, numbers that are finite if everything is, and the 16 of the pose.
 
     ``depths`` and ``opacities`` are those of all Gaussians, as a nan among them would decide who is not rendered.
     """
-    norms = torch._foreach_norm([depths, opacities, projection.means, projection.covariances, colors])
+    everything = [depths, opacities, projection.means, projection.covariances, colors]
+    norms = torch._foreach_norm(everything if background is None else [*everything, background])
     sums = [x.reshape(1) for x in (projection.depths.sum(), *norms)]
     return torch.cat([*sums, camera.world_to_camera.reshape(16)])
 
 
-def add_background(numbers: Tensor, background: Tensor) -> bool:
-    """Add a background that is new on this device to the numbers that are checked; return whether that was to do."""
-    if background.is_inference() or background.device != numbers.device:
-        return False
-    if new := _finite.get(background) != background._version:
-        numbers[1].add_(background.detach().sum())
-    return new
+def new_background(background: Tensor | None, device: torch.device) -> Tensor | None:
+    """Return a background that can be checked with the numbers of a projection: of one color, on this device, and new.
+
+    The others are None here, and looked at by `checked_background`.
+    """
+    if background is None or background.is_inference() or background.shape != (3,) or background.device != device:
+        return None
+    known = not background.is_floating_point() or _finite.get(background) == background._version
+    return None if known else background
 
 
 @torch.no_grad()
 def check_projection(
-    numbers: Sequence[float],
     projected: Projected,
     inputs: Mapping[str, Tensor],
     camera: Camera,
@@ -61,14 +64,14 @@ def check_projection(
 ) -> None:
     """Raise unless all numbers are finite and the world's coordinates not too large.
 
-    Only if the numbers (of `Projected`, on the processor) add up to nan or infinity are the inputs
-    (of all Gaussians, by name) examined one by one. Else the background, if one was added to them, is finite, too.
+    Only if the numbers add up to nan or infinity are the inputs (of all Gaussians, by name) examined one by one. Else
+    the background, if one is among the numbers, is finite, too.
 
     Raises:
         NotFiniteError: if an input, which the message names, or a projection is nan or infinite.
         ValueError: if the rounding of the coordinates moves Gaussians by more than `MAX_ROUNDING`.
     """
-    projection, colors = projected.projection, projected.colors
+    projection, colors, numbers = projected.projection, projected.colors, projected.numbers.tolist()
     depth, total, view = numbers[0], sum(numbers[:-16]), numbers[-16:]
     # How far the camera is from the world's origin along each axis: -R^T t.
     far = max(abs(sum(view[4 * row + axis] * view[4 * row + 3] for row in range(3))) for axis in range(3))

@@ -144,14 +144,16 @@ class _CompiledEngine:
         self.absolute_gradients = compositing.absolute_gradients
         self.moments, self.shares = moments.moments, moments.shares
 
-    def project(self, inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
+    def project(
+        self, inputs: dict[str, Tensor], camera: Camera, degree: int | None, background: Tensor | None = None
+    ) -> Projected:
         """Project the Gaussians; refuse a pose that waits for a gradient, which none of the kernels computes."""
         if torch.is_grad_enabled() and camera.world_to_camera.requires_grad:
             raise NotImplementedError(
                 f"the engine {self.name} has no gradient of the camera's pose: use_engine('torch') has, or detach "
                 "world_to_camera."
             )
-        projected: Projected = self._project(inputs, camera, degree)
+        projected: Projected = self._project(inputs, camera, degree, background)
         return projected
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
 from reference_trainer.camera import Camera
-from reference_trainer.render.checks import add_background, check_projection, checked_background, checked_colors
+from reference_trainer.render.checks import check_projection, checked_background, checked_colors, new_background
 from reference_trainer.render.engine import engine_for
 from reference_trainer.render.splats import MomentImages, Rendering, Splats
 
@@ -64,15 +62,13 @@ def _splat(
     with torch.autocast(means.device.type, enabled=False):
         camera = camera.to(means.device, inputs["means"].dtype)
         engine = engine_for(means.device, inputs["means"].dtype)
-        projected = engine.project(inputs, camera, degree)
-        if background is not None and not add_background(projected.numbers, background):
-            background = None
-        check = partial(check_projection, projected=projected, inputs=inputs, camera=camera, background=background)
+        background = new_background(background, means.device)
+        projected = engine.project(inputs, camera, degree, background)
+        check_projection(projected, inputs, camera, background)
         # Which tile a splat touches is a decision, not a quantity: nothing flows through the lists.
         with torch.no_grad():
-            lists = engine.bin(projected, camera.width, camera.height, check)
-        indices, projection, opacities, shown, _ = projected
-        return Splats(indices, projection, opacities, shown, lists, engine)
+            lists = engine.bin(projected, camera.width, camera.height)
+        return Splats(projected.indices, projected.projection, projected.opacities, projected.colors, lists, engine)
 
 
 def _working(name: str, x: Tensor, dtype: torch.dtype) -> Tensor:

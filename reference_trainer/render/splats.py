@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
@@ -12,7 +11,17 @@ from torch import Tensor
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import TILE
 
-__all__ = ["Engine", "MomentImages", "Projected", "Projection", "Rendering", "Splats", "TileLists", "ViewSplats"]
+__all__ = [
+    "Engine",
+    "MomentImages",
+    "Projected",
+    "Projection",
+    "Rendering",
+    "Splats",
+    "TileCounts",
+    "TileLists",
+    "ViewSplats",
+]
 
 
 class Projection(NamedTuple):
@@ -29,6 +38,15 @@ class Projection(NamedTuple):
     depths: Tensor  # along the camera's z axis, shape (M,)
 
 
+class TileCounts(NamedTuple):
+    """How many tiles of the image Gaussians touch, counted with their projection to wait for a card only once."""
+
+    each: Tensor  # shape (M,), int32
+    touched: Tensor  # whether it is above 0, (M,) bool
+    numbers: Tensor  # of the engine's kernels, on the card
+    total: int = 0  # sum over the Gaussians
+
+
 class Projected(NamedTuple):
     """M of N Gaussians that lie in view of a camera, projected and colored."""
 
@@ -37,6 +55,7 @@ class Projected(NamedTuple):
     opacities: Tensor  # activated, (M,)
     colors: Tensor  # towards this camera, (M, 3)
     numbers: Tensor  # what `check_projection` reads
+    counts: TileCounts | None = None  # of the engine triton
 
 
 @dataclass(frozen=True)
@@ -159,23 +178,23 @@ class Engine(Protocol):
 
     name: str
 
-    def project(self, inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
+    def project(
+        self, inputs: dict[str, Tensor], camera: Camera, degree: int | None, background: Tensor | None = None
+    ) -> Projected:
         """Project the Gaussians that lie in view and evaluate their colors.
 
         These are the ones beyond `NEAR_PLANE` with an opacity of at least `MIN_ALPHA`. The inputs,
         by name, are means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh
-        (N, K, 3), used up to band ``degree``, or colors (N, 3), whose ``degree`` is None.
+        (N, K, 3), used up to band ``degree``, or colors (N, 3), whose ``degree`` is None. A
+        background (3,) is checked with the numbers.
         """
 
-    def bin(self, projected: Projected, width: int, height: int, check: Callable[[list[float]], None]) -> TileLists:
+    def bin(self, projected: Projected, width: int, height: int) -> TileLists:
         """List the Gaussians of every tile.
 
         A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the
         rectangle spanned by the tile's pixel centers. The test is exact: within a row of tiles, an
         ellipse covers an interval of columns.
-
-        ``check`` is called with the numbers of the projection, and raises if they are not finite:
-        here, because a card has to be waited for once for them and for the length of the lists.
         """
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:

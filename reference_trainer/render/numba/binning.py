@@ -7,7 +7,6 @@ which are thereby in order of depth as well.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -158,9 +157,8 @@ def _ends(counts: Array) -> Array:
     return result
 
 
-def bin_gaussians(projected: Projected, width: int, height: int, check: Callable[[list[float]], None]) -> TileLists:
+def bin_gaussians(projected: Projected, width: int, height: int) -> TileLists:
     """List the Gaussians of every tile, see `Engine.bin`."""
-    check(projected.numbers.tolist())
     m, f, c, z = (x.detach().numpy() for x in projected.projection)
     o = projected.opacities.detach().contiguous().numpy()  # if all are in view, those that were given
     count, tiles, order = m.shape[0], -(-width // TILE) * -(-height // TILE), _nearest_first(z)

@@ -350,7 +350,9 @@ class _Project(torch.autograd.Function):
         return (*found, None, None, None)
 
 
-def project(inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
+def project(
+    inputs: dict[str, Tensor], camera: Camera, degree: int | None, background: Tensor | None = None
+) -> Projected:
     """Project and color Gaussians, see `Engine.project`; no gradient reaches the camera's pose."""
     depths, indices = visible(inputs, camera)
     # Plain colors are passed as coefficients (N, 1, 3) of degree -1.
@@ -359,7 +361,7 @@ def project(inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Pr
         inputs["means"], inputs["quaternions"], inputs["scales"], sh, indices, camera, band
     )
     projection, opacities = Projection(*found), inputs["opacities"]
-    numbers = numbers_to_check(depths, opacities, projection, colors, camera)
+    numbers = numbers_to_check(depths, opacities, projection, colors, camera, background)
     if indices.shape[0] < opacities.shape[0]:
         opacities = opacities.index_select(0, indices)
     return Projected(indices, projection, opacities, colors, numbers)

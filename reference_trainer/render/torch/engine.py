@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -18,9 +16,8 @@ from reference_trainer.render.torch.projection import evaluate_sh, project, visi
 __all__ = ["TorchEngine", "bin_gaussians"]
 
 
-def bin_gaussians(projected: Projected, width: int, height: int, check: Callable[[list[float]], None]) -> TileLists:
+def bin_gaussians(projected: Projected, width: int, height: int) -> TileLists:
     """List the Gaussians of every tile, see `Engine.bin`."""
-    check(projected.numbers.tolist())
     projection, opacities, device = projected.projection, projected.opacities, projected.opacities.device
     order = torch.argsort(projection.depths, stable=True)
     mean_x, mean_y = projection.means[order].unbind(-1)
@@ -86,7 +83,9 @@ class TorchEngine:
 
     name = "torch"
 
-    def project(self, inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
+    def project(
+        self, inputs: dict[str, Tensor], camera: Camera, degree: int | None, background: Tensor | None = None
+    ) -> Projected:
         """Project and color Gaussians."""
         depths, indices = visible(inputs, camera)
         seen = inputs if degree is None else inputs | {"sh": inputs["sh"][:, : (degree + 1) ** 2]}
@@ -98,7 +97,7 @@ class TorchEngine:
         else:
             directions = torch.nn.functional.normalize(seen["means"] - camera.position, dim=-1)
             colors = evaluate_sh(seen["sh"], directions, degree)
-        numbers = numbers_to_check(depths, inputs["opacities"], projection, colors, camera)
+        numbers = numbers_to_check(depths, inputs["opacities"], projection, colors, camera, background)
         return Projected(indices, projection, seen["opacities"], colors, numbers)
 
     bin = staticmethod(bin_gaussians)

@@ -1,8 +1,8 @@
-"""Which Gaussian touches which tile of the image, in depth order: one sort, and one wait of the processor."""
+"""Which Gaussian touches which tile of the image, in depth order: one sort by depth, one by tile."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import torch
 import triton
@@ -10,10 +10,10 @@ import triton.language as tl
 from torch import Tensor
 
 from reference_trainer.render.constants import MIN_ALPHA, TILE
-from reference_trainer.render.splats import Projected, TileLists
+from reference_trainer.render.splats import Projected, TileCounts, TileLists
 from reference_trainer.render.triton.tiles import launch
 
-__all__ = ["bin_gaussians"]
+__all__ = ["bin_gaussians", "count_tiles"]
 
 _MIN_ALPHA = tl.constexpr(MIN_ALPHA)
 _GROUP = 32  # Gaussians of a program, one per lane of a warp,
@@ -27,24 +27,29 @@ def _boundary(dy, side, limit, x, l11, l21, l22):
     return x + (side * half - l21 * dy) / l11
 
 
-@triton.jit(do_not_specialize=["count", "width", "height", "columns", "listing"])
+@triton.jit(do_not_specialize=["width", "height", "columns", "listing"])
 def list_tiles(
     order, means, factors, covariances, opacities, counts, ends, touched,
-    keys, gaussians, count, width, height, columns, listing, TILE: tl.constexpr,
+    keys, gaussians, numbers, width, height, columns, listing, TILE: tl.constexpr,
     GROUP: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Count the tiles of Gaussians, nearest first, or list them, from ``ends - counts`` on.
+    """Count the tiles of Gaussians and add them up, or list them, nearest first, each from ``ends - counts`` on.
 
     Both by the same machine code: two compilations could contract products and sums differently, and a tile on the
-    boundary of an ellipse be counted and not listed.
+    boundary of an ellipse be counted and not listed. The last two of the 20 numbers are how many Gaussians are in view,
+    which the processor does not know when they are counted, and the sum of their tiles.
 
     Within a row of tiles, the pixel centers from dy = upper to lower, an ellipse |(l11 dx + l21 dy, l22 dy)|^2 < limit
     reaches furthest to the right at its tip, dy = xy sqrt(limit / xx), or at the end of the row that is nearest to it;
     furthest to the left likewise, at -tip. So a row's tiles are an interval, exactly.
     """
     k = tl.program_id(0) * GROUP + tl.arange(0, GROUP)
+    count = tl.load(numbers + 18).to(tl.int32)
+    if tl.program_id(0) * GROUP >= count:
+        return
     real = k < count
-    i = tl.load(order + k, mask=real, other=0).to(tl.int32)
+    listed = k < count * listing
+    i = tl.where(listed, tl.load(order + k, mask=listed, other=0).to(tl.int32), k)  # counted in their own order
     x, y = tl.load(means + 2 * i, mask=real), tl.load(means + 2 * i + 1, mask=real)
     l11, l21 = tl.load(factors + 3 * i, mask=real, other=1.0), tl.load(factors + 3 * i + 1, mask=real, other=0.0)
     l22 = tl.load(factors + 3 * i + 2, mask=real, other=1.0)
@@ -60,8 +65,7 @@ def list_tiles(
     finite = (tl.abs(x) + tl.abs(y) + reach) < float("inf")
     rows = tl.where(real & finite & (bottom >= top), bottom // TILE - first_row + 1, 0)
     found = tl.zeros([GROUP], tl.int32)
-    # While counting, both are not yet written, and the difference not used.
-    place = tl.load(ends + k, mask=real, other=0) - tl.load(counts + k, mask=real, other=0)
+    place = tl.load(ends + k, mask=listed, other=0) - tl.load(counts + i, mask=listed, other=0)
     for r in range(0, tl.max(rows)):
         row = first_row + r
         upper = (row * TILE).to(tl.float32) + 0.5 - y
@@ -81,43 +85,55 @@ def list_tiles(
                 tl.store(gaussians + at, i[:, None] + tl.zeros([1, LANES], tl.int32), mask=mask)
         found += spanned
     if listing == 0:
-        tl.store(counts + k, found, mask=real)
+        tl.store(counts + i, found, mask=real)
         tl.store(touched + i, found > 0, mask=real)
+        tl.atomic_add(numbers + 19, tl.sum(found).to(tl.float64), sem="relaxed")
 
 
-def bin_gaussians(projected: Projected, width: int, height: int, check: Callable[[list[float]], None]) -> TileLists:
+def _launch(
+    listing: bool, order: Tensor, shapes: Sequence[Tensor], counts: TileCounts, ends: Tensor, entries: Sequence[Tensor],
+    width: int, height: int,
+) -> None:  # fmt: skip
+    outputs = counts.each, ends, counts.touched.view(torch.uint8), *entries, counts.numbers
+    launch(
+        list_tiles, (-(-len(counts.each) // _GROUP),), order, *shapes, *outputs, width, height, -(-width // TILE),
+        int(listing), TILE=TILE, GROUP=_GROUP, LANES=_LANES,
+    )  # fmt: skip
+
+
+def _key_type(width: int, height: int) -> torch.dtype:
+    """Return the type of the number of a tile, and of how many there are."""
+    return torch.int16 if -(-width // TILE) * -(-height // TILE) < 2**15 else torch.int32
+
+
+def count_tiles(shapes: Sequence[Tensor], numbers: Tensor, width: int, height: int) -> TileCounts:
+    """Count the tiles that each Gaussian touches; their sum goes to the last of the numbers, see `list_tiles`.
+
+    The shapes are means, factors, covariances and opacities, with room for all Gaussians.
+    """
+    each = numbers.new_empty(len(shapes[0]), dtype=torch.int32)
+    counts = TileCounts(each, torch.empty_like(each, dtype=torch.bool), numbers)
+    unread = numbers.view(torch.int64)
+    _launch(False, unread, shapes, counts, unread, (each.view(_key_type(width, height)), each), width, height)
+    return counts
+
+
+def bin_gaussians(projected: Projected, width: int, height: int) -> TileLists:
     """List the Gaussians of every tile, see `Engine.bin`.
 
     Listed nearest first, they only need a stable sort by tile: of 16-bit numbers in two passes, where keys of tile and
     depth would take eight. It holds at most 24 bytes per entry, the lists among them.
     """
-    _, projection, opacities, _, numbers = projected
-    columns, count = -(-width // TILE), len(opacities)
-    tiles = columns * -(-height // TILE)
-    # Signed: the edges below go up to the number of tiles itself.
-    short = torch.int16 if tiles < 2**15 else torch.int32
-    order = torch.argsort(projection.depths, stable=True)
-    shapes = (
-        x.detach().contiguous() for x in (projection.means, projection.factors, projection.covariances, opacities)
-    )
-    counts, ends = order.new_empty(count, dtype=torch.int32), torch.empty_like(order)
-    touched = order.new_empty(count, dtype=torch.bool)
-    given = order, *shapes, counts, ends, touched.view(torch.uint8)
-
-    def fill(keys: Tensor, gaussians: Tensor, listing: int) -> None:
-        size = count, width, height, columns, listing
-        constants = {"TILE": TILE, "GROUP": _GROUP, "LANES": _LANES}
-        launch(list_tiles, (-(-count // _GROUP),), *given, keys, gaussians, *size, **constants)
-
-    nothing = counts[:0]
-    fill(nothing.view(short), nothing, 0)
-    torch.cumsum(counts, 0, out=ends)
-    read = torch.cat([numbers.view(torch.int64), ends[-1:]]).cpu()  # the one wait for the card, but for who is in view
-    total = int(read[-1]) if count else 0
-    check(read[: len(numbers)].view(torch.float64).tolist())
-    keys, gaussians = counts.new_empty(total, dtype=short), counts.new_empty(total)
-    if total:
-        fill(keys, gaussians, 1)
+    _, p, opacities, _, _, counts = projected
+    assert counts is not None  # this engine's `project` counts
+    order = torch.argsort(p.depths, stable=True)
+    ends = torch.cumsum(counts.each[order], 0)
+    keys, gaussians = (counts.each.new_empty(counts.total, dtype=x) for x in (_key_type(width, height), torch.int32))
+    shapes = [x.detach().contiguous() for x in (p.means, p.factors, p.covariances, opacities)]
+    if counts.total:
+        _launch(True, order, shapes, counts, ends, (keys, gaussians), width, height)
     keys, by_tile = torch.sort(keys, stable=True)
-    edges = torch.arange(tiles + 1, dtype=short, device=order.device)
-    return TileLists(width, height, torch.searchsorted(keys, edges, out_int32=True), gaussians[by_tile], touched)
+    # Signed: the edges go up to the number of tiles itself.
+    edges = torch.arange(-(-width // TILE) * -(-height // TILE) + 1, dtype=keys.dtype, device=keys.device)
+    starts = torch.searchsorted(keys, edges, out_int32=True)
+    return TileLists(width, height, starts, gaussians[by_tile], counts.touched)

@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.splats import Projected, Projection
+from reference_trainer.render.triton.binning import count_tiles
 from reference_trainer.render.triton.tiles import launch
 
 __all__ = ["project"]
@@ -178,29 +179,44 @@ def _add_unless_finite(numbers, x):
 
 
 @triton.jit(do_not_specialize=["count"])
-def find_visible(means, opacities, view, visible, numbers, count, BLOCK: tl.constexpr):
-    """Tell who is in view; the numbers (18,) are those of `check_projection`, zeros before."""
+def find_visible(means, opacities, view, background, visible, numbers, count, BLOCK: tl.constexpr):
+    """Tell who is in view; the first 18 numbers, zeros before, are those of `check_projection`."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     real = i < count
     opacity = tl.load(opacities + i, mask=real, other=0.0)
     _right, _down, forward = _view(view)
     z = tl.where(real, _dot(forward, _load3(means + 3 * i, real)) + tl.load(view + 11), 0.0)
-    tl.store(visible + i, ((z > _NEAR_PLANE) & (opacity >= _MIN_ALPHA)).to(tl.uint8), mask=real)
+    tl.store(visible + i, ((z > _NEAR_PLANE) & (opacity >= _MIN_ALPHA)).to(tl.int32), mask=real)
     _add_unless_finite(numbers, z + 0 * opacity)
     if tl.program_id(0) == 0:
         # The pose travels with the sums that the processor waits for: to read it on its own would be another wait.
         j = tl.arange(0, 16)
         tl.store(numbers + 2 + j, tl.load(view + j).to(tl.float64))
+        _add_unless_finite(numbers, tl.load(background + j, mask=j < 3, other=0.0))
 
 
 @triton.jit(do_not_specialize=["count"])
+def index_visible(places, indices, numbers, count, BLOCK: tl.constexpr):
+    """List who is in view, in order, from the running number of these, and tell how many they are."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    real = i < count
+    place = tl.load(places + i, mask=real, other=0)
+    before = tl.load(places + i - 1, mask=real & (i > 0), other=0)
+    tl.store(indices + before, i.to(tl.int64), mask=place > before)
+    tl.store(numbers + (0 * i + 18), place.to(tl.float64), mask=i == count - 1)
+
+
+@triton.jit
 def project_forward(
     indices, means, quaternions, scales, sh, opacities, view, centers,
-    factors, covariances, depths, colors, shown_opacities, numbers, count, fx, fy, cx, cy,
+    factors, covariances, depths, colors, shown_opacities, numbers, fx, fy, cx, cy,
     limit_x, limit_y, BANDS: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Project and color; BANDS harmonics of the ROW given ones, or plain colors if it is 0."""
+    """Project and color who is in view; BANDS harmonics of the ROW given ones, or plain colors if it is 0."""
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    count = tl.load(numbers + 18).to(tl.int32)
+    if tl.program_id(0) * BLOCK >= count:
+        return
     real = k < count
     i = tl.load(indices + k, mask=real, other=0)
     tl.store(shown_opacities + k, tl.load(opacities + i, mask=real), mask=real)
@@ -332,28 +348,16 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, opacities: Tensor, indices: Tensor,
-        numbers: Tensor, camera: Camera, bands: int,
+        ctx: Any, means: Tensor, quaternions: Tensor, scales: Tensor, sh: Tensor, opacities: Tensor,
+        outputs: list[Tensor], saved: list[Tensor], size: tuple[float, ...], constants: dict[str, int],
     ) -> tuple[Tensor, ...]:  # fmt: skip
-        limits = (
-            FRUSTUM_MARGIN * 0.5 * size / f for size, f in ((camera.width, camera.fx), (camera.height, camera.fy))
-        )
-        ctx.size = len(indices), camera.fx, camera.fy
-        ctx.limits = tuple(limits)
-        ctx.constants = {"warps": 4, "BANDS": bands, "ROW": sh.shape[1], "BLOCK": _BLOCK}
-        given = [x.detach().contiguous() for x in (indices, means, quaternions, scales, sh)]
-        view = camera.world_to_camera.contiguous()
-        outputs = tuple(means.new_empty(len(indices), *shape) for shape in ((2,), (3,), (3,), (), (3,), ()))
-        launch(
-            project_forward, (triton.cdiv(len(indices), _BLOCK),), *given, opacities.detach().contiguous(), view,
-            *outputs, numbers, *ctx.size, camera.cx, camera.cy, *ctx.limits, **ctx.constants,
-        )  # fmt: skip
-        ctx.save_for_backward(*given, view, outputs[4])
+        ctx.size, ctx.constants = size, constants
+        ctx.save_for_backward(*saved, outputs[4])
         # The covariances only decide on tiles and radii, which have no gradient.
         ctx.mark_non_differentiable(outputs[2])
         # Gradients that nobody asked for stay None: the kernel then leaves the depths out instead of adding zeros.
         ctx.set_materialize_grads(False)
-        return outputs
+        return tuple(outputs)
 
     @staticmethod
     @once_differentiable
@@ -374,7 +378,7 @@ class _Project(torch.autograd.Function):
         parts = (colors.new_empty if whole else colors.new_zeros)(sum(sizes)).split(sizes)
         found = [x[: shape.numel()].view(shape) for x, shape in zip(parts, shapes, strict=True)]
         launch(
-            project_backward, (triton.cdiv(len(indices), _BLOCK),), *saved, *upstream, *found, *ctx.size, *ctx.limits,
+            project_backward, (triton.cdiv(len(indices), _BLOCK),), *saved, *upstream, *found, len(indices), *ctx.size,
             *(x.stride(0) for x in upstream), DEPTHS=depths, **ctx.constants,
         )  # fmt: skip
         return (*found, None, None, None, None)
@@ -385,17 +389,40 @@ def _rows(x: Tensor) -> Tensor:
     return x if x.ndim == 1 or x.stride(1) == 1 else x.contiguous()
 
 
-def project(inputs: dict[str, Tensor], camera: Camera, degree: int | None) -> Projected:
-    """Project and color Gaussians, see `Engine.project`; no gradient reaches the camera's pose."""
-    view, means, opacities = camera.world_to_camera, inputs["means"], inputs["opacities"]
-    count = len(means)
-    visible = torch.empty(count, dtype=torch.bool, device=means.device)
-    numbers = torch.zeros(2 + 16, dtype=torch.float64, device=means.device)
-    given = [x.detach().contiguous() for x in (means, opacities, view)]
-    launch(find_visible, (triton.cdiv(count, 1024),), *given, visible.view(torch.uint8), numbers, count, BLOCK=1024)
-    indices = torch.nonzero(visible).squeeze(1)
+def project(
+    inputs: dict[str, Tensor], camera: Camera, degree: int | None, background: Tensor | None = None
+) -> Projected:
+    """Project and color Gaussians, see `Engine.project`; no gradient reaches the camera's pose.
+
+    How many are in view, and how many tiles they touch, is read back with the numbers to check, the one wait for a
+    card: until then all has room for all Gaussians.
+    """
+    means, opacities = inputs["means"], inputs["opacities"]
     sh, bands = (inputs["colors"][:, None], 0) if degree is None else (inputs["sh"], (degree + 1) ** 2)
+    differentiable = means, inputs["quaternions"], inputs["scales"], sh, opacities
+    *given, plain = (x.detach().contiguous() for x in differentiable)
+    view, count = camera.world_to_camera.detach().contiguous(), len(means)
+    numbers = torch.zeros(2 + 16 + 2, dtype=torch.float64, device=means.device)
+    visible = torch.empty(count, dtype=torch.int32, device=means.device)
+    color = view if background is None else background.detach().to(view).contiguous()  # the pose is checked anyway
+    grid, block = (triton.cdiv(count, 1024),), {"warps": 4, "BLOCK": 1024}
+    launch(find_visible, grid, given[0], plain, view, color, visible, numbers, count, **block)
+    indices = torch.empty_like(visible, dtype=torch.int64)
+    launch(index_visible, grid, torch.cumsum(visible, 0, dtype=torch.int32), indices, numbers, count, **block)
+    outputs = [means.new_empty(count, *shape) for shape in ((2,), (3,), (3,), (), (3,), ())]
+    limits = (FRUSTUM_MARGIN * 0.5 * size / f for size, f in ((camera.width, camera.fx), (camera.height, camera.fy)))
+    of_x, of_y = limits
+    constants = {"warps": 4, "BANDS": bands, "ROW": sh.shape[1], "BLOCK": _BLOCK}
+    launch(
+        project_forward, (triton.cdiv(count, _BLOCK),), indices, *given, plain, view, *outputs, numbers,
+        camera.fx, camera.fy, camera.cx, camera.cy, of_x, of_y, **constants,
+    )  # fmt: skip
+    counts = count_tiles([*outputs[:3], outputs[5]], numbers, camera.width, camera.height)
+    read = numbers.cpu()  # the one wait for the card
+    seen = int(read[18])
+    indices, *outputs = (x[:seen] for x in (indices, *outputs))
     *found, colors, shown = _Project.apply(  # type: ignore[no-untyped-call]
-        means, inputs["quaternions"], inputs["scales"], sh, opacities, indices, numbers, camera, bands
+        *differentiable, outputs, [indices, *given, view], (camera.fx, camera.fy, of_x, of_y), constants
     )
-    return Projected(indices, Projection(*found), shown, colors, numbers)
+    counts = counts._replace(each=counts.each[:seen], touched=counts.touched[:seen], total=int(read[19]))
+    return Projected(indices, Projection(*found), shown, colors, read[:18], counts)
