@@ -1,4 +1,4 @@
-"""A penalty on needles, a candidate of the setting's ninth choice: ``--loss "photometric + benchmarks.needles:Needles()"``."""
+"""A penalty on needles, a candidate of the ninth choice: ``--loss "photometric + benchmarks.needles:Needles()"``."""
 
 from __future__ import annotations
 
