@@ -44,6 +44,7 @@ _HIDDEN = "warp + hidden left out"
 _WARPS = ("warp", "warp + no smoothness", _HIDDEN, f"{_HIDDEN} + no smoothness")
 _RATES = ("means x4", "means x1/4", "means by pixels", "opacities x1/2", "scales x1/2", "colors x1/2")
 _NAMED = ("rate 0.1", "random background", "rate 0.35", "flat")
+_SHAPES = ("D-SSIM 0.4", "needles", "needles, weakly")
 _COUNTS = ("5,000 dense and few", "8,000 dense and few", "30,000 dense and few", "filled")
 CHOICES = {
     "third": Choice(("rate 0.3", "no reset", "threshold 3e-4"), seeds=(0,)),
@@ -54,6 +55,8 @@ CHOICES = {
     "seventh": Choice(_COUNTS, seeds=range(6), starts=True),
     "eighth": Choice(_NAMED, seeds=range(6)),
     "eighth, second round": Choice(_NAMED, seeds=range(6), tried=(0, 1)),
+    "ninth": Choice(_SHAPES, seeds=range(6)),
+    "ninth, second round": Choice(_SHAPES, seeds=range(6), tried=(0, 1)),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
