@@ -168,7 +168,7 @@ class Regularized:
                 self._hook.note_regularized()
         *images, info = call()
         if keep is not None:  # on several GPUs, too: info holds this rank's Gaussians, in the cameras of all ranks
-            self._hide_dropped(info, keep.view(opacities.shape))
+            self._hide_dropped(info, keep.view_as(opacities))
         return (*images, info)
 
     def _hide_dropped(self, info: MutableMapping[str, Any], keep: Tensor) -> None:
