@@ -37,7 +37,7 @@ def draw_numbers(
         )
     if generator is None:  # not passed on: with it, a compiled graph could not draw for a number that changes
         return sample(n, dtype=torch.float32, device=device)
-    if isinstance(generator, PortableGenerator):
+    if type(generator) is PortableGenerator:  # isinstance would ask torch's metaclass, which takes longer than a draw
         return generator.numbers(sample, n, device)
     x = sample(n, generator=generator, dtype=torch.float32, device=generator.device)
     return x if device is None else x.to(device)

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from importlib.util import find_spec
-from itertools import islice
 from types import CodeType, FrameType, ModuleType
 from typing import Any, ClassVar, NamedTuple
 
@@ -71,8 +70,9 @@ class Call:
         if self._positional is None:
             bound = inspect.BoundArguments(self._signature.full, self.arguments)
             return self.function(*bound.args, **bound.kwargs)
-        items = iter(self.arguments.items())  # bound in order: those given by position come first
-        return self.function(*(x for _, x in islice(items, self._positional)), **dict(items))
+        values, items = list(self.arguments.values()), list(self.arguments.items())
+        first = self._positional  # bound in order: those given by position come first
+        return self.function(*values[:first], **dict(items[first:]))
 
     def takes(self, name: str) -> bool:
         """Whether the function has an argument of this name, given or not."""
@@ -100,16 +100,16 @@ class Call:
                 f"a regularizer changed {field}, which belongs to the call and is no field of the Gaussians."
             )
         name = self.names.get(field, field)
-        shape = self.arguments[name].shape
-        self.arguments[name] = value if value.shape == shape else value.reshape(shape)
+        given = self.arguments[name]
+        self.arguments[name] = value if value.shape == given.shape else value.reshape_as(given)
 
-    def params(self, chain: Chain, step: int, *, testing: bool = False) -> Params:
+    def params(self, regularizer: Regularizer, step: int, *, testing: bool = False) -> Params:
         """Return the opacities (N,) and the other needed fields, batches flattened; ValueError if one is missing."""
         opacities: Tensor = self.arguments["opacities"]
         if opacities.ndim != 1:
             opacities = opacities.reshape(-1)
         found: dict[str, Any] = {}
-        for name in chain.needs:
+        for name in regularizer.needs:
             if name in ("opacities", "step"):
                 continue
             value = self.get(name)
@@ -117,6 +117,7 @@ class Call:
                 value = value.flatten(0, -3 if name == "sh" else -2)
             if value is None or (name != "view_matrix" and len(value) != len(opacities)):
                 # A test render of, say, plain colors is no concern of a regularizer that leaves test renders alone.
+                chain = Chain(regularizer)
                 users = [x for x in chain if name in x.needs and type(x).expected is not Regularizer.expected]
                 if testing and not users:
                     continue
@@ -127,16 +128,18 @@ class Call:
             found[name] = value
         return Params(opacities, step=step, **found)
 
-    def train(self, chain: Chain, step: int, tally: Tally, generator: torch.Generator | None) -> Tensor | None:
+    def train(
+        self, regularizer: Regularizer, step: int, tally: Tally, generator: torch.Generator | None
+    ) -> Tensor | None:
         """Apply a draw to the arguments; return which Gaussians it kept, None if it dropped none."""
-        given = self.params(chain, step)
-        # A call of the chain checks more, and takes longer: the first one is enough.
-        regularize = chain.regularize if tally.regularized else chain
+        given = self.params(regularizer, step)
+        # A call of the module checks more, and takes longer: the first one is enough.
+        regularize = regularizer.regularize if tally.regularized else regularizer
         if self._replace(given, regularize(given, generator=generator)):
             tally.count_regularized(step)
         else:
             tally.skipped[Skip.RATE_ZERO] += 1
-        return chain.keep
+        return regularizer.keep
 
     def evaluate(self, chain: Chain, step: int, tally: Tally) -> None:
         """Apply the test-time values to the arguments."""
@@ -148,10 +151,12 @@ class Call:
 
     def _replace(self, before: Params, after: Params) -> bool:
         """Put the changed fields into the arguments; return whether there were any."""
-        changed = [name for name, a, b in zip(Params._fields, before, after, strict=True) if a is not b]
-        for name in changed:
-            self.put(name, getattr(after, name))
-        return bool(changed)
+        changed = False
+        for name, a, b in zip(Params._fields, before, after, strict=True):
+            if a is not b:
+                self.put(name, getattr(after, name))
+                changed = True
+        return changed
 
 
 def _who(chain: Chain, attribute: str, *names: str) -> str:
@@ -244,19 +249,19 @@ def hide_dropped(returned: Any, keep: Tensor) -> tuple[Any, ...]:
     """
     if not isinstance(returned, tuple):
         raise TypeError(f"the rasterizer returned {type(returned).__name__}, expected a tuple with colors and radii.")
-    count = len(keep)
-    shapes = ((count,), (count, 1), (count, 2))
-    counts = [isinstance(x, Tensor) and not x.is_floating_point() and x.shape in shapes for x in returned]
-    if not any(counts):
+    count = keep.shape[0]
+    members = list(returned)
+    hidden = False
+    for i, x in enumerate(returned):
+        if isinstance(x, Tensor) and not x.is_floating_point() and x.shape in ((count,), (count, 1), (count, 2)):
+            members[i] = x * (keep if x.ndim == 1 else keep[:, None]).to(x.device)
+            hidden = True
+    if not hidden:
         found = ", ".join(f"{x.dtype} {tuple(x.shape)}" if isinstance(x, Tensor) else str(type(x)) for x in returned)
         raise ValueError(
             f"the rasterizer returned ({found}) for {count} Gaussians, expected an integer tensor of shape ({count},), "
             "the radii: without them dropped Gaussians cannot be hidden from densification."
         )
-    members = [
-        x * keep.view(-1, *[1] * (x.ndim - 1)).to(x.device) if is_count else x
-        for x, is_count in zip(returned, counts, strict=True)
-    ]
     # Keep named tuples.
     made: tuple[Any, ...] = returned._make(members) if hasattr(returned, "_make") else tuple(members)
     return made

@@ -25,7 +25,7 @@ class ModelSteps:
         self.step = step
         self._by_parameters = steps == "parameters"
         self._updates_end_step: bool | None = None
-        self._versions: tuple[tuple[int, int], ...] = ()
+        self._versions: list[tuple[int, int]] = []
         self._place: Hashable = None
 
     @property
@@ -53,13 +53,13 @@ class ModelSteps:
             self.begin(self.step + 1)
         return rendered
 
-    def count_render(self, parameters: tuple[Tensor, ...], place: Hashable) -> bool:
+    def count_render(self, parameters: list[Tensor], place: Hashable) -> bool:
         """Count a training render; return whether it was requested at the same place as the first one of its step.
 
         A change of the parameters' versions shows that they were trained on, which begins a step. Where calls of
         update_learning_rate begin the steps, it raises a RuntimeError instead, because one of these calls is missing.
         """
-        versions = tuple((id(x), x._version) for x in parameters)
+        versions = [(id(x), x._version) for x in parameters]
         trained = self.renders > 0 and versions != self._versions
         self._versions = versions
         if trained and self._by_parameters:
@@ -93,8 +93,9 @@ class Iterations:
     def steps_of(self, owner: Any) -> ModelSteps:
         """Return the steps of a model or of a parameter; new ones if it was not seen before."""
         # Densification replaces parameters: a new one takes over the steps of one that is gone, one step later.
-        self._vacant += [steps for ref, steps in self._models if ref() is None]
-        self._models = [(ref, steps) for ref, steps in self._models if ref() is not None]
+        if vacant := [steps for ref, steps in self._models if ref() is None]:
+            self._vacant += vacant
+            self._models = [(ref, steps) for ref, steps in self._models if ref() is not None]
         for ref, steps in self._models:
             if ref() is owner:
                 return steps
@@ -120,9 +121,10 @@ class Iterations:
 
     def step(self, step: int) -> None:
         """Begin a step of all models."""
-        rendered = self._step is None or any(steps.renders for _, steps in self._models)
+        rendered = self._step is None
         self._step = step
         for _, steps in self._models:
+            rendered |= steps.renders > 0
             steps.begin(step)
         if not rendered:
             self._lose_step()

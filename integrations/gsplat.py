@@ -29,8 +29,7 @@ from ._calls import Call, Signature, chain_of
 from ._report import Hook, Tally
 
 __all__ = [
-    "Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized",
-    "unregularized_calls",
+    "Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized_calls",
 ]  # fmt: skip
 
 Rasterization = Callable[..., tuple[Any, ...]]
@@ -168,7 +167,7 @@ class Regularized:
                 self._hook.note_regularized()
         *images, info = call()
         if keep is not None:  # on several GPUs, too: info holds this rank's Gaussians, in the cameras of all ranks
-            self._hide_dropped(info, keep.view(opacities.shape))
+            self._hide_dropped(info, keep.view_as(opacities))
         return (*images, info)
 
     def _hide_dropped(self, info: MutableMapping[str, Any], keep: Tensor) -> None:
@@ -302,11 +301,6 @@ def load_gsplat(device: torch.device | None = None) -> Any:
             "gsplat>=1.4; a script that was written for an older one may need changes of its own."
         )
     return gsplat
-
-
-def unregularized(rasterization: Rasterization) -> Rasterization:
-    """Return the wrapped function if ``rasterization`` is regularized, else ``rasterization`` itself."""
-    return rasterization.rasterization if isinstance(rasterization, Regularized) else rasterization
 
 
 @contextmanager

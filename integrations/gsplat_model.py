@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ca_reg.lists import PixelLists
 
-from .gsplat import load_gsplat, unregularized
+from .gsplat import Rasterization, load_gsplat, unregularized_calls
 
 __all__ = ["GsplatModel", "GsplatView"]
 
@@ -115,13 +115,15 @@ class GsplatModel:
 
     def _rasterize(self, opacity: Tensor, view: GsplatView, **colors: Any) -> tuple[Any, ...]:
         """Return colors, alphas and ``meta`` of gsplat's own render."""
-        return unregularized(load_gsplat(self.means.device).rasterization)(
-            **self._given(view),
-            **colors,
-            opacities=opacity.reshape(-1),
-            backgrounds=None if self.background is None else self.background[None],
-            rasterize_mode="antialiased" if self.antialiased else "classic",
-        )
+        rasterization: Rasterization = load_gsplat(self.means.device).rasterization
+        with unregularized_calls():
+            return rasterization(
+                **self._given(view),
+                **colors,
+                opacities=opacity.reshape(-1),
+                backgrounds=None if self.background is None else self.background[None],
+                rasterize_mode="antialiased" if self.antialiased else "classic",
+            )
 
     def _given(self, view: GsplatView) -> dict[str, Any]:
         """Return the arguments that gsplat's functions share, for one camera."""

@@ -114,12 +114,14 @@ class RasterizerHook(Hook):
             if value not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}.")
         self._chain = chain_of(regularizer)
-        if not len(self._chain):
+        members = list(self._chain)
+        if not members:
             raise ValueError("regularizer is empty; without one there is nothing to install.")
-        for member in self._chain:
+        for member in members:
             if isinstance(member, WrappedModule):
                 member.check_generator()
         check_count(seed, "seed", minimum=0)
+        self._trained = members[0] if len(members) == 1 else self._chain  # the same draws with a layer less
         self._parts = tuple(self._chain.modules())
         self._names = second_regularizers(self._chain)
         self._counts_zeros = self._chain.drops and not allow_zeros
@@ -211,7 +213,7 @@ class RasterizerHook(Hook):
             return self._leave(call, Skip.CONSTANT_OPACITY)
         if not means.requires_grad:
             return self._leave(call, Skip.DETACHED_MEANS)
-        parameters = tuple(x for x in (means if means.is_leaf else None, leaf_of(opacities)) if x is not None)
+        parameters = [x for x in (means if means.is_leaf else None, leaf_of(opacities)) if x is not None]
         # Without a model, a parameter takes its place; without either, all calls belong to one model.
         steps = self._iterations.steps_of(model if model is not None else parameters[0] if parameters else self)
         if not steps.count_render(parameters, site.place) and self._scope == "main":
@@ -242,8 +244,10 @@ class RasterizerHook(Hook):
         generator = self._generator(steps.index, step, call.arguments["opacities"].device)
         if False in [part.training for part in self._parts]:
             self._chain.train()
-        self._chain.set_step(step)
-        keep = call.train(self._chain, step, self.tally, generator)
+        # The chain checks the first opacities, even if its member was called before.
+        regularizer = self._trained if self.tally.regularized else self._chain
+        regularizer.set_step(step)
+        keep = call.train(regularizer, step, self.tally, generator)
         self.note_regularized()
         returned = call()
         return returned if keep is None else hide_dropped(returned, keep)

@@ -158,6 +158,13 @@ def test_masks_follow_from_seed_and_step_and_leave_the_global_random_numbers_alo
     assert not torch.equal(run(0, [3]), run(1, [3]))
 
 
+def test_logits_are_refused_even_if_the_module_was_called_before(rasterizer):
+    dropout, model = GaussianDropout(0.4), Model()
+    dropout(torch.full((3,), 0.5))
+    with pytest.raises(ValueError, match="activated"), RasterizerHook(dropout, rasterizer=rasterizer):
+        rasterize(rasterizer, model, model.camera, BLACK, opacities=model._opacity)
+
+
 @pytest.mark.parametrize(
     ("arguments", "at_end"),
     [
