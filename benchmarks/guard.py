@@ -117,7 +117,8 @@ def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
 @torch.no_grad()
 def quality(model: TrainedModel, view: View) -> float:
     """Return the PSNR of a view."""
-    return psnr(model.test_rendering(view).image.clamp(0, 1), view.image, view.mask)
+    image = view.as_taken(model.test_rendering(view).image).clamp(0, 1)
+    return psnr(image, view.as_taken(view.image), view.mask)
 
 
 @torch.no_grad()

@@ -181,6 +181,8 @@ def _measure(
     photograph, mask, truth = (view.image, view.mask, view.depth) if isinstance(view, View) else (None, None, None)
     out = model.test_rendering(view, depth=truth is not None)
     image, quality = out.image.clamp(0, 1), dict.fromkeys(("psnr", "ssim", "lpips"), math.nan)
+    if isinstance(view, View):
+        image, photograph = view.as_taken(out.image).clamp(0, 1), view.as_taken(view.image)
     if photograph is not None and counted(photograph, mask).numel():
         pair = on_white(image, mask), on_white(photograph, mask)
         quality |= {"psnr": psnr(image, photograph, mask), "ssim": ssim(*pair)}

@@ -186,7 +186,8 @@ def pictures_of(
     found, said = {"render": image_uri(image)}, []
     if isinstance(view, View):
         found["error"] = heat_uri(error_picture(image, view.image))
-        if not math.isnan(measured := psnr(image, view.image, view.mask)):  # its mask may leave no pixel
+        pair = view.as_taken(image), view.as_taken(view.image)
+        if not math.isnan(measured := psnr(*pair, view.mask)):  # its mask may leave no pixel
             said.append(f"PSNR {measured:.2f} dB")
     if expected is not None:
         half = avg_pool2d(expected.error[None], 2, ceil_mode=True)[0]  # it is smooth, and a third of the size

@@ -275,7 +275,8 @@ def _train(
         return model_of(trainer).moments(opacity, view, *rest)
 
     def quality(opacity: Tensor, view: View) -> float:  # the monitor's own test-time scaling knows only dropout
-        return psnr(model_of(trainer).test_rendering(view).image.clamp(0, 1), view.image, view.mask)
+        image = view.as_taken(model_of(trainer).test_rendering(view).image).clamp(0, 1)
+        return psnr(image, view.as_taken(view.image), view.mask)
 
     def details(opacity: Tensor, view: View) -> dict[str, Tensor]:
         return training_snapshot(model_of(trainer), view)

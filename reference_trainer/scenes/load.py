@@ -16,6 +16,7 @@ from reference_trainer.json_files import read_json
 from reference_trainer.scenes.colmap import COLMAP
 from reference_trainer.scenes.dense import THIN, dense_start, made_unasked
 from reference_trainer.scenes.depth import point_prior, true_priors, with_prior
+from reference_trainer.scenes.exposure import with_one_exposure
 from reference_trainer.scenes.formats import Capture, find_reader, only_default, register_format
 from reference_trainer.scenes.frames import Frame, corner_displacement, load_view
 from reference_trainer.scenes.images import LARGE_IMAGE, image_size, unreadable_photographs
@@ -92,6 +93,10 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
         cloud, about_points = dense_start(views["train"], cloud)
     elif options.points == "auto" and start is None:
         cloud, about_points = _enough_points(cloud, about_points, views["train"], train, generator)
+    about_exposure = ""
+    if options.one_exposure:
+        *of_splits, about_exposure = with_one_exposure(views["train"], views["test"], cloud.positions)
+        views = dict(zip(views, of_splits, strict=True))
     if options.depth == "points":
         views["train"] = tuple(point_prior(view, cloud) for view in views["train"])
     elif options.depth is not None:
@@ -111,7 +116,7 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
         start=start,
         background=color,
         source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
-        notes=tuple(filter(None, (about_unread, about_size, about_lenses, about_masks, about_points))),
+        notes=tuple(filter(None, (about_unread, about_size, about_lenses, about_masks, about_points, about_exposure))),
     )
 
 

@@ -61,6 +61,9 @@ class SceneOptions:
     """Make pictures smaller by this factor; by default those above half a megapixel are reduced to that."""
     background: str = "auto"
     """"black" or "white" behind transparent pictures; "auto" is white for Blender scenes, else black."""
+    one_exposure: bool = False
+    """Make photographs of different exposure or white balance equally bright, by the points that they share; nothing
+    where they do not differ. Test views are compared at the exposure that the cameras beside them suggest."""
     undistort: bool = True
     """Undo lens distortion; published sparse-view protocols, such as LLFF's, leave it in."""
     allow_test_points: bool = False

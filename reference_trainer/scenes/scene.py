@@ -43,6 +43,12 @@ class View(Viewpoint):
     depth_prior: Tensor | None = None
     """What a loss may compare depth with, larger where farther, of unknown scale and shift, shape (H, W): a depth, or a
     negated inverse depth; nan where unknown."""
+    exposure: Tensor | None = None
+    """By how much the photograph was brighter than the scene's others, shape (3,), if `image` was divided by it."""
+
+    def as_taken(self, image: Tensor) -> Tensor:
+        """Return the image (3, H, W), or a render of this view, with the photograph's own exposure."""
+        return image if self.exposure is None else image * self.exposure[:, None, None]
 
 
 @dataclass(frozen=True)
