@@ -82,6 +82,7 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "depth of the points": ("loss", "pearson("),
     "flat": ("loss", "flat("),
     "D-SSIM 0.4": ("loss", "photometric(0.4)"),
+    "threshold 7e-4": ("densify_gradient", 7e-4),
     "needles": ("loss", "Needles(0.02,"),
     "needles, weakly": ("loss", "Needles(0.002,"),
     "means x4": ("means_rate", 6.4e-4),

@@ -251,7 +251,9 @@ class Run:
             raise FileNotFoundError(f"there is no {cloud} for --points: give auto, dense, random or one that is there.")
         steps, pixels = PRESETS["quick" if self.quick else "quality" if self.quality else "default"]
         factor = max(1.0, math.sqrt(math.prod(_usual(self._sizes(scene).values())) / pixels))
-        options = SceneOptions(str(scene), test=self.test, points=self.points, downscale=round(factor, 3))
+        options = SceneOptions(
+            str(scene), test=self.test, points=self.points, downscale=round(factor, 3), one_exposure=True
+        )
         config = with_recipe(RECIPE, iterations=steps)
         if (self.folder / run.CONFIG).exists() and self.again not in ("poses", "train"):
             try:

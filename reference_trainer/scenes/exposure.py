@@ -28,9 +28,10 @@ def with_one_exposure(
     """Divide photographs by how much brighter they are than the others, and return a note on it.
 
     For a test view, whose photograph must not be looked at, that is what the training cameras beside it suggest,
-    `exposure_between`. Where the photographs do not differ, the views are those that were given.
+    `exposure_between`. Where the photographs do not differ, or were cut out and stand on a background of one color, the
+    views are those that were given.
     """
-    factors = exposures(train, positions)
+    factors = None if any(view.alpha is not None for view in train) else exposures(train, positions)
     if factors is None:
         return tuple(train), tuple(test), ""
     cameras = [view.camera for view in train]
