@@ -140,15 +140,16 @@ TABLES: Mapping[str, Callable[[RowStore], str]] = {
 def page(text: str, store: RowStore) -> str:
     """Return the text of a page with everything between its marks regenerated.
 
-    The marks are ``<!-- paper WHAT NAME ITERATIONS -->`` and ``<!-- end -->``. WHAT is a key of `TABLES`, ``details``
-    or ``gains`` for the claim NAME, ``details`` without a name for all claims, or ``rows`` for all rows of
-    ``NAME.json`` beside the folder, whose entry ``usual`` holds the parts of a setting that labels omit. ITERATIONS
-    are by default those of ``store``.
+    The marks are ``<!-- paper WHAT NAME ITERATIONS -->`` and ``<!-- end -->``. WHAT is a key of `TABLES`, which have
+    no NAME, ``details`` or ``gains`` for the claim NAME, ``details`` without a name for all claims, or ``rows`` for all
+    rows of ``NAME.json`` beside the folder, whose entry ``usual`` holds the parts of a setting that labels omit.
+    ITERATIONS are by default those of ``store``.
     """
 
     def made(match: re.Match[str]) -> str:
         what, name = match[2], match[3]
-        of = RowStore(store.folder, store.recipe, int(match[4])) if match[4] else store
+        steps = match[4] or (name if what in TABLES else None)
+        of = RowStore(store.folder, store.recipe, int(steps)) if steps else store
         if what in TABLES:
             body = TABLES[what](of) or "Not yet measured.\n"
         elif what == "rows":

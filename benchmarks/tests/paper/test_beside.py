@@ -98,5 +98,13 @@ def test_rows_are_counted_by_where_they_come_from(add, tmp_path):
 
 
 def test_a_mark_of_a_table_without_rows_says_so(tmp_path):
-    text = "<!-- paper seeds -->\nstale\n<!-- end -->\n"
-    assert page(text, RowStore(tmp_path)) == "<!-- paper seeds -->\nNot yet measured.\n<!-- end -->\n"
+    made = page("<!-- paper seeds -->\nstale\n<!-- end -->\n", RowStore(tmp_path))
+    assert made.splitlines()[1] == "Not yet measured."
+
+
+def test_a_mark_of_a_table_names_its_steps(add, tmp_path):
+    add("fern", 20.0)
+    add("fern-504", 20.0, steps=PAPER_STEPS)
+    for steps, scene in (("", "fern"), (f" {PAPER_STEPS}", "fern-504")):
+        text = page(f"<!-- paper origins{steps} -->\n<!-- end -->\n", RowStore(tmp_path))
+        assert [row[0] for row in cells(text)[1:-1]] == [scene]
