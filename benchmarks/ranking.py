@@ -21,7 +21,7 @@ from ca_reg import CAScore
 from ca_reg.functional import Multiplier
 from ca_reg.types import read_moments
 from reference_trainer.cli import log_shown
-from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.metrics import first_order_map, psnr
 from reference_trainer.evaluation.style import WIDTH, color, readable
 from reference_trainer.evaluation.tables import markdown_table, mean_std
 from reference_trainer.evaluation.trained_model import TrainedModel
@@ -43,6 +43,7 @@ VARIANTS = {
     "limit_conditioned": "the variance of exact_half over the region of protocol_half",
     "weighted_half": "the variance of exact_half over all pixels, weighted by their expected alpha",
     "neutral_half": "exact_half composited over the expected color instead of the background",
+    "first_order_half": "the paper's formula p (1 - p) sum (c alpha)^2 at drop rate 1/2, over the region of exact_half",
 }
 """The scores that are compared, in the order of the tables."""
 
@@ -86,6 +87,8 @@ def score_view(model: TrainedModel, view: View, *, index: int) -> dict[str, floa
     values["unconditioned"] = _average(half.variance, exact_half.visible)
     values["limit_conditioned"] = _average(exact_half.variance, half.visible)
     values["weighted_half"] = _average(exact_half.variance, moments.alpha_mean)
+    first_order = first_order_map(model.splats(opacities, view), Multiplier.dropout(_HALF)).mean(0)
+    values["first_order_half"] = _average(first_order, exact_half.visible)
     image = model.test_rendering(view).image.clamp(0, 1)
     return {
         "psnr": psnr(image, view.image, view.mask),

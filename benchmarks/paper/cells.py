@@ -36,6 +36,8 @@ __all__ = ["Cell", "Grid", "declared", "estimate", "is_done", "listing", "rows_o
 EXTRAS = frozenset({"path", "renders", "depth"})
 """What a training can be measured for beyond the usual."""
 SIXTHS = 6
+COURSE = ("ca/train", "psnr/test", "psnr/train")
+"""What is kept at every sixth of the steps beside the CA of test views, under the names of the log."""
 OPAQUE = 0.8
 DENSER = 2
 """Factor on the iterations for the model of all photographs, whose depth serves as the truth."""
@@ -220,8 +222,11 @@ def measured(cell: Cell, run: Path, results: Mapping[str, Any], dense: Path, dev
     row: Row = {"setting": dict(cell.setting), "seed": cell.seed, **means, "gaussians": results["gaussians"],
                 "seconds": results["processor_seconds"]}  # fmt: skip
     if "path" in cell.needs:
-        log = [json.loads(line) for line in (run / LOG_NAME).read_text("utf-8").splitlines()]
-        row["path"] = {str(sixth): each["ca/test"] for sixth, each in enumerate(log[:SIXTHS], start=1)}
+        log = [json.loads(line) for line in (run / LOG_NAME).read_text("utf-8").splitlines()][:SIXTHS]
+        row["path"], *others = (
+            {str(sixth): each[name] for sixth, each in enumerate(log, start=1)} for name in ("ca/test", *COURSE)
+        )
+        row["course"] = dict(zip(COURSE, others, strict=True))
     if cell.needs & {"renders", "depth"}:
         model, scene = load_run_model(run, device)
         views = [view.to(device) for view in scene.test]

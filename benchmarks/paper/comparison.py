@@ -82,15 +82,23 @@ def overall(verdicts: Iterable[Verdict], *, needs_all: bool = False) -> Verdict:
 
 
 class RowStore:
-    """The kept rows of all scenes in a folder, looked up for one recipe and number of iterations."""
+    """The kept rows of all scenes in a folder, looked up for one recipe, number of iterations, and the first seeds.
 
-    def __init__(self, folder: Path, recipe: str = "3dgs", iterations: int = 3_000) -> None:
-        self.folder, self.recipe, self.iterations = folder, recipe, iterations
+    Args:
+        folder: with ``NAME.json`` for each scene.
+        recipe: of settings that do not name another.
+        iterations: of every training.
+        seeds: only seeds below this number; None for all.
+    """
+
+    def __init__(self, folder: Path, recipe: str = "3dgs", iterations: int = 3_000, seeds: int | None = None) -> None:
+        self.folder, self.recipe, self.iterations, self.seeds = folder, recipe, iterations, seeds
         self.scenes = {file.stem: Rows(file) for file in sorted(folder.glob("*.json"))}
 
     def of(self, scene: str, setting: Mapping[str, object]) -> dict[int, Row]:
         """Return the rows of a setting on a scene by seed."""
-        return self.scenes[scene].of(resolved(setting, self.recipe, self.iterations))
+        found = self.scenes[scene].of(resolved(setting, self.recipe, self.iterations))
+        return {seed: row for seed, row in found.items() if self.seeds is None or seed < self.seeds}
 
 
 def tested(claim: Claim, store: RowStore) -> list[str]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import re
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 
+from benchmarks.paper.beside import beside_table, origins_table, rates_table, seeds_table, sizes_table
 from benchmarks.paper.claims import AT_PAPER_SIZE, CLAIMS, TIMED, Check
 from benchmarks.paper.comparison import (
     ERRORS,
@@ -24,7 +25,7 @@ from benchmarks.paper.comparison import (
 from benchmarks.paper.rows import Row, Rows, label, value
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table
 
-__all__ = ["claims_table", "details", "gains", "page", "scenes_table"]
+__all__ = ["TABLES", "claims_table", "details", "gains", "page", "scenes_table"]
 
 _TITLES = {
     "test psnr": ("PSNR", 1.0), "test ssim": ("SSIM", 1.0), "test lpips": ("LPIPS", 1.0), "test ca": ("CA", 1e-3),
@@ -38,7 +39,13 @@ _TITLES = {
     "renders scaled": ("scaled opacities", 1.0),
     "renders mean": ("D: exact mean", 1.0), "depth abs_rel": ("AbsRel", 1.0), "depth rmse": ("RMSE", 1.0),
     "depth mae": ("MAE", 1.0), "depth log10": ("log10", 1.0),
-} | {f"path {sixth}": (f"CA at {sixth}/6", 1e-3) for sixth in range(1, 7)}  # fmt: skip
+} | {
+    figure.format(sixth): (f"{title} at {sixth}/6", unit)
+    for sixth in range(1, 7)
+    for figure, title, unit in (
+        ("path {}", "CA", 1e-3), ("course ca/train {}", "CA, training views,", 1e-3),
+        ("course psnr/test {}", "PSNR", 1.0), ("course psnr/train {}", "PSNR, training views,", 1.0))
+}  # fmt: skip
 _MARKS = re.compile(r"(<!-- paper (\w+)(?: ([\w-]+))?(?: (\d+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -88,14 +95,14 @@ def gains(name: str, store: RowStore) -> str:
 
 
 def scenes_table(store: RowStore) -> str:
-    """Return one row per scene: its trainings, their processor hours, and how far the PSNR of seeds differs.
+    """Return one row per scene: its trainings, their processor hours, and how far the PSNR of seeds differs; then all.
 
     Standard deviations are of settings with three seeds or more, pooled: of the trainings of one setting, and of the
     differences of two settings, seed by seed. With the number of seeds in the last column, two standard errors of such
     a difference are 0.1 dB.
     """
     columns = ["scene", "trainings", "hours", "one training", "difference of two", "seeds for ± 0.1 dB"]
-    lines = []
+    lines, trainings, seconds = [], 0, 0.0
     for scene, rows in store.scenes.items():
         of = [row for row in rows.rows if row["setting"]["iterations"] == store.iterations]
         if not of:
@@ -105,29 +112,46 @@ def scenes_table(store: RowStore) -> str:
             found.setdefault(label(row["setting"]), {})[row["seed"]] = value(row, "test psnr")
         several = [seeds for seeds in found.values() if len(seeds) > 2]
         apart = [[a[seed] - b[seed] for seed in a.keys() & b.keys()] for a, b in combinations(several, 2)]
-        cells: list[object] = [scene, len(of), f"{sum(value(row, 'seconds') for row in of) / 3600:.1f}"]
+        spent = sum(value(row, "seconds") for row in of)
+        trainings, seconds = trainings + len(of), seconds + spent
+        cells: list[object] = [scene, len(of), f"{spent / 3600:.1f}"]
         if variances := [statistics.variance(each) for each in apart if len(each) > 1]:
             one = math.sqrt(statistics.fmean(statistics.variance(seeds.values()) for seeds in several))
             two = math.sqrt(statistics.fmean(variances))
             cells += [f"{one:.2f} dB", f"{two:.2f} dB", math.ceil((ERRORS * two / 0.1) ** 2)]
         lines.append(dict(zip(columns, cells, strict=False)))
+    if len(lines) > 1:
+        lines.append({"scene": "all", "trainings": trainings, "hours": f"{seconds / 3600:.1f}"})
     return markdown_table(lines, columns)
+
+
+TABLES: Mapping[str, Callable[[RowStore], str]] = {
+    "claims": claims_table,
+    "scenes": scenes_table,
+    "beside": beside_table,
+    "sizes": sizes_table,
+    "seeds": seeds_table,
+    "rates": rates_table,
+    "origins": origins_table,
+}
+"""Tables of all rows, by the word in their mark."""
 
 
 def page(text: str, store: RowStore) -> str:
     """Return the text of a page with everything between its marks regenerated.
 
-    The marks are ``<!-- paper WHAT NAME ITERATIONS -->`` and ``<!-- end -->``. WHAT is ``claims`` for the verdicts,
-    ``scenes`` for `scenes_table`, ``details`` or ``gains`` for the claim NAME, ``details`` without a name for all
-    claims, or ``rows`` for all rows of ``NAME.json`` beside the folder, whose entry ``usual`` holds the parts of a
-    setting that labels omit. ITERATIONS are by default those of ``store``.
+    The marks are ``<!-- paper WHAT NAME ITERATIONS -->`` and ``<!-- end -->``. WHAT is a key of `TABLES`, which have
+    no NAME, ``details`` or ``gains`` for the claim NAME, ``details`` without a name for all claims, or ``rows`` for all
+    rows of ``NAME.json`` beside the folder, whose entry ``usual`` holds the parts of a setting that labels omit.
+    ITERATIONS are by default those of ``store``.
     """
 
     def made(match: re.Match[str]) -> str:
         what, name = match[2], match[3]
-        of = RowStore(store.folder, store.recipe, int(match[4])) if match[4] else store
-        if what in ("claims", "scenes"):
-            body = (claims_table if what == "claims" else scenes_table)(of)
+        steps = match[4] or (name if what in TABLES else None)
+        of = RowStore(store.folder, store.recipe, int(steps)) if steps else store
+        if what in TABLES:
+            body = TABLES[what](of) or "Not yet measured.\n"
         elif what == "rows":
             body = _rows(Rows(store.folder.parent / f"{name}.json"))
         elif name:

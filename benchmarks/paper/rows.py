@@ -21,7 +21,8 @@ __all__ = ["Row", "Rows", "config_of", "label", "resolved", "value"]
 Row = dict[str, Any]
 """``setting`` and ``seed``, ``commit``, ``version``, ``cpu``, ``device`` unless that is it, the kind of ``lpips``, and
 figures: ``test`` and ``train`` from `evaluate`, as means over views, ``gaussians``, ``seconds`` of processor time, and
-``path``, ``renders`` and ``depth`` where measured."""
+``path`` with ``course`` (CA of test views and the rest at every sixth of the steps), ``renders`` and ``depth`` where
+measured."""
 
 
 def resolved(setting: Setting, recipe: str, iterations: int) -> dict[str, Any]:

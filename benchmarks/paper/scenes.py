@@ -11,7 +11,7 @@ from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.losses import LOSSES
 from reference_trainer.training.losses.term import PriorTerm
 
-__all__ = ["PAPER_SIZE", "SCENES", "PaperScene", "chosen_scenes"]
+__all__ = ["PAPER_SIZE", "PAPER_STEPS", "SCENES", "PaperScene", "chosen_scenes"]
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,10 @@ PAPER_SIZE = {
     "dtu-scan65-400": PaperScene(replace(SCENES["dtu-scan65"].options, downscale=1.0), "DTU scan65 at 400x300"),
     "dtu-scan24-384": PaperScene(replace(SCENES["dtu-scan24"].options, downscale=1.0), "DTU scan24 at 384x384"),
 }
-"""Scenes of the paper's data sets again, with pictures of its size, for 10,000 steps on a card."""
+"""Scenes of the paper's data sets again, with pictures of its size."""
+
+PAPER_STEPS = 10_000
+"""Steps of the trainings at the paper's size."""
 
 
 def chosen_scenes(names: Sequence[str], data: Path, own: SceneOptions) -> dict[str, PaperScene]:

@@ -92,6 +92,7 @@ def test_five_renders_without_a_hole_know_the_variance_given_no_hole(walls, name
         assert row["exact_half"] == pytest.approx(limit, rel=1e-4)
         assert row["weighted_half"] == pytest.approx(limit, rel=1e-4)
         assert row["neutral_half"] == pytest.approx(over_own_color, rel=1e-4, abs=1e-7)
+        assert row["first_order_half"] == pytest.approx(sum((OPACITY * gray) ** 2 for gray in grays) / 4, rel=1e-4)
         # The exact variance does not know of the masks: only the region is theirs.
         seen = math.isfinite(row["protocol_half"])
         assert row["limit_conditioned"] == pytest.approx(limit, rel=1e-4) if seen else True
@@ -109,7 +110,7 @@ def test_conditioning_on_visibility_turns_an_order_around(walls):
     (row,) = disagreements(runs)
     assert row.pop("A / B") == "equal / unequal"
     higher = {variant for variant, ratio in row.items() if float(ratio) > 1}
-    assert higher == {"exact", "exact_half", "unconditioned", "limit_conditioned", "weighted_half"}
+    assert higher == {"exact", "exact_half", "unconditioned", "limit_conditioned", "weighted_half", "first_order_half"}
     table = correlations(runs)
     for sign, variant, against in (
         (-1, "protocol_half", "rho exact_half"), (-1, "neutral_half", "tau exact_half"),

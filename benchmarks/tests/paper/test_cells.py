@@ -231,6 +231,8 @@ def test_two_claims_on_the_built_in_scene(tmp_path, monkeypatch, capsys):
     assert not list((tmp_path / "out" / "synthetic").glob("*/seed_*"))
     assert all(len(json.dumps(each)) < 1_500 for each in rows)
     assert all(0 < value(each, "depth abs_rel") < 2 and list(each["path"]) == list("123456") for each in rows)
+    assert all({*map(len, each["course"].values())} == {6} for each in rows)
+    assert all(math.isfinite(value(each, f"course psnr/train {sixth}")) for each in rows for sixth in range(1, 7))
     assert [math.isfinite(value(each, "renders five")) for each in rows] == [False, True, False] * 2
     kept = RowStore(tmp_path / "rows", "3dgs", 20)
     assert judged(CLAIMS["9"], kept).keys() == judged(CLAIMS["14"], kept).keys() == {"synthetic"}

@@ -125,6 +125,7 @@ def test_the_table_of_scenes_pools_what_seeds_differ_by_over_settings_and_pairs(
     one, two = math.sqrt(6 / 3), math.sqrt(2 / 3)
     assert lines[2] == f"| a | 10 | 0.2 | {one:.2f} dB | {two:.2f} dB | {math.ceil(400 * 2 / 3)} |"
     assert lines[3] == "| b | 1 | 0.0 | n/a | n/a | n/a |"
+    assert lines[4] == "| all | 11 | 0.2 | n/a | n/a | n/a |"
 
 
 def test_details_show_what_is_measured_and_every_check(store):
