@@ -162,7 +162,7 @@ def test_logits_are_refused_even_if_the_module_was_called_before(rasterizer):
     dropout, model = GaussianDropout(0.4), Model()
     dropout(torch.full((3,), 0.5))
     with pytest.raises(ValueError, match="activated"), RasterizerHook(dropout, rasterizer=rasterizer):
-        rasterize(rasterizer, model, model.camera, BLACK, opacities=model._opacity)
+        rasterize(rasterizer, model, model.camera, BLACK, opacities=model.parameters()[3])
 
 
 @pytest.mark.parametrize(

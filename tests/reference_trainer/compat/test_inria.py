@@ -20,11 +20,11 @@ BACKGROUND = torch.tensor([0.3, 0.1, 0.7])
 def small_model(device="cpu"):
     """A few large Gaussians, one of which is behind the camera."""
     model = Model(N, seed=5, device=device)
+    means, scales, _, opacities, _ = model.parameters()
     with torch.no_grad():
-        model._scaling += 1.0
-        model._opacity.clamp_(-1.5, 2.0)
-        pose = model.camera.world_to_camera
-        model._xyz[BEHIND] -= 5 * pose[2, :3]
+        scales += 1.0
+        opacities.clamp_(-1.5, 2.0)
+        means[BEHIND] -= 5 * model.camera.world_to_camera[2, :3]
     return model
 
 
@@ -112,7 +112,7 @@ def test_weights_are_the_gradient_of_their_picture_in_a_color(made):
     model, render, moments = made
     render(model.camera, model, PIPE, BACKGROUND)["render"][0].sum().backward()
     weights = moments.weights(model.get_opacity, model.camera)
-    torch.testing.assert_close(weights, model._features.grad[:, 0].double(), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(weights, model.parameters()[4].grad[:, 0].double(), rtol=1e-5, atol=1e-6)
     assert weights[BEHIND] == 0
 
 
