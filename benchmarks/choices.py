@@ -15,7 +15,17 @@ from typing import Literal
 
 from benchmarks.paper.rows import value
 from benchmarks.paper.scenes import SCENES
-from benchmarks.setting import FEWEST, HELD_OUT, LATER, REFERENCES, Row, from_dense, references_of, rows_of
+from benchmarks.setting import (
+    FEWEST,
+    HELD_OUT,
+    LATER,
+    ONE_EXPOSURE,
+    REFERENCES,
+    Row,
+    from_dense,
+    references_of,
+    rows_of,
+)
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = ["BY_DEFAULT", "CHOICES", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "pairs_of", "tables"]
@@ -57,6 +67,7 @@ CHOICES = {
     "eighth, second round": Choice(_NAMED, seeds=range(6), tried=(0, 1)),
     "ninth": Choice(_SHAPES, seeds=range(6)),
     "ninth, second round": Choice(_SHAPES, seeds=range(6), tried=(0, 1)),
+    "tenth": Choice((ONE_EXPOSURE,), seeds=range(6), tried=(0, 1, 2)),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""

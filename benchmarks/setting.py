@@ -101,6 +101,8 @@ LATER = "from 1,000"
 """What the second choice chose: ``--recipe sparse``."""
 DENSE = "from 1,000, dense start"
 """The same as a user has it, with the start that it has by default."""
+ONE_EXPOSURE = "one exposure"
+"""What the tenth choice adds: photographs made equally bright, ``--one-exposure``."""
 SEEDS = 5
 """So many, from 0 on, judge the chosen one."""
 FEWEST = 3
@@ -149,7 +151,7 @@ def main(
         known = {(row["scene"], row["candidate"], row["seed"]) for row in rows}
         for run in paths:
             options, config = read_run_settings(run / "config.json")
-            if (_scene(options), candidate(config), config.seed) not in known:
+            if (_scene(options), candidate(config, options), config.seed) not in known:
                 rows.append(measured(run, load_lpips(lpips)))
                 write_json(out, rows)
     elif what == "shared":
@@ -157,7 +159,11 @@ def main(
         views = shared_views(paths[0])
         for run in paths[1:]:
             options, config = read_run_settings(run / "config.json")
-            (row,) = (x for x in rows_of(rows, _scene(options), candidate(config)).values() if x["seed"] == config.seed)
+            (row,) = (
+                x
+                for x in rows_of(rows, _scene(options), candidate(config, options)).values()
+                if x["seed"] == config.seed
+            )
             row["shared"] = fmean(quality(load_run_model(run)[0], view) for view in views)
             write_json(out, rows)
     else:
@@ -179,13 +185,15 @@ def tables(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def candidate(config: TrainConfig) -> str:
+def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
     """Return the name of a candidate, or of what it is compared with.
 
     Example:
         >>> candidate(TrainConfig(dropout=0.2, analytic=True, opacity_decay=0.998))
         'expectation, decay 0.998'
     """
+    if options is not None and options.one_exposure:
+        return f"{candidate(config)} + {ONE_EXPOSURE}"
     begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
     if config.analytic:
         return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
@@ -210,7 +218,7 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
     options, config = read_run_settings(run / "config.json")
     results = read_json(run / "results.json")
     name = Path(options.path).name
-    row: Row = {"scene": _scene(options), "candidate": candidate(config), "seed": config.seed}
+    row: Row = {"scene": _scene(options), "candidate": candidate(config, options), "seed": config.seed}
     if (name in HELD_OUT or name.endswith("-many")) and row["candidate"].removesuffix(f", {LATER}") not in _REFERENCES:
         row["held-out"] = fmean(quality(model, view) for view in _held_out(options, config.seed))
     test, metric = results["mean"]["test"], results.get("perceptual_metric")

@@ -63,7 +63,7 @@ class SceneOptions:
     """"black" or "white" behind transparent pictures; "auto" is white for Blender scenes, else black."""
     one_exposure: bool = False
     """Make photographs of different exposure or white balance equally bright, by the points that they share; nothing
-    where they do not differ. Test views are compared at the exposure that the cameras beside them suggest."""
+    where they do not differ. Test views are compared at the exposure that the training cameras suggest."""
     undistort: bool = True
     """Undo lens distortion; published sparse-view protocols, such as LLFF's, leave it in."""
     allow_test_points: bool = False
