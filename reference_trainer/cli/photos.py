@@ -86,6 +86,8 @@ class Run:
     """Initial points, as for `ca-reg train`, such as "dense"."""
     test: Literal["none", "auto"] = "none"
     """"auto" holds photographs out to measure the quality at, as `ca-reg train` does; by default all of them train."""
+    one_exposure: bool = False
+    """Make photographs of different exposure or white balance equally bright, as `ca-reg train` does."""
     open: bool = True
     """Open the page in a browser, where there is one."""
     device: Device = "cpu"
@@ -252,7 +254,7 @@ class Run:
         steps, pixels = PRESETS["quick" if self.quick else "quality" if self.quality else "default"]
         factor = max(1.0, math.sqrt(math.prod(_usual(self._sizes(scene).values())) / pixels))
         options = SceneOptions(
-            str(scene), test=self.test, points=self.points, downscale=round(factor, 3), one_exposure=True
+            str(scene), test=self.test, points=self.points, downscale=round(factor, 3), one_exposure=self.one_exposure
         )
         config = with_recipe(RECIPE, iterations=steps)
         if (self.folder / run.CONFIG).exists() and self.again not in ("poses", "train"):
