@@ -28,6 +28,7 @@ from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes import load_scene, synthetic_scene
+from reference_trainer.scenes.exposure import like_training
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.studies.study import Record, Records, Study, run_study
@@ -114,9 +115,9 @@ def held_out(options: SceneOptions, seed: int) -> Scene:
     if options.path == "synthetic":
         return replace(scene, test=synthetic_scene(test_views=5, points=1).test[:-1])
     used = {view.name for view in (*scene.train, *scene.test)}
-    everything = load_scene(replace(options, split="auto", test="none"), trains=False).train
+    everything = load_scene(replace(options, split="auto", test="none", one_exposure=False), trains=False).train
     if others := tuple(view for view in everything if view.name not in used):
-        return replace(scene, test=others)
+        return replace(scene, test=like_training(others, scene.train))
     half = len(scene.train) // 2
     out = {seed % half, seed % half + half}
     split: dict[bool, list[View]] = {True: [], False: []}

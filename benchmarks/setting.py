@@ -440,7 +440,8 @@ def from_dense(scene: str) -> str:
 
 
 def _is_second(candidate: str) -> bool:
-    return set(candidate.split(" + ")) <= _SECOND.keys()
+    names = set(candidate.split(" + "))
+    return names <= _SECOND.keys() or ONE_EXPOSURE in names
 
 
 def rows_of(rows: Sequence[Row], scene: str, name: str) -> dict[int, Row]:

@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 from reference_trainer.camera import Camera
 from reference_trainer.scenes.scene import View
 
-__all__ = ["exposure_at", "exposures", "with_one_exposure"]
+__all__ = ["exposure_between", "exposures", "like_training", "with_one_exposure"]
 
 _CELL = 8  # pixels: of points in one cell of a picture the nearest hide the others
 _NEAR = 1.03  # points up to so many times as far as the nearest of their cell are seen
@@ -27,18 +27,26 @@ def with_one_exposure(
 ) -> tuple[tuple[View, ...], tuple[View, ...], str]:
     """Divide photographs by how much brighter they are than the others, and return a note on it.
 
-    For a test view, whose photograph must not be looked at, that is what the training cameras beside it suggest,
-    `exposure_at`. Where the photographs do not differ, or were cut out and stand on a background of one color, the
+    For a test view, whose photograph must not be looked at, that is what the training cameras suggest, see
+    `like_training`. Where the photographs do not differ, or were cut out and stand on a background of one color, the
     views are those that were given.
     """
     factors = None if any(view.alpha is not None for view in train) else exposures(train, positions)
     if factors is None:
         return tuple(train), tuple(test), ""
-    cameras = [view.camera for view in train]
-    guessed = [exposure_at(view.camera, cameras, factors) for view in test]
     largest = float((factors.amax(0) / factors.amin(0)).max())
     note = f"exposures differ by up to {100 * (largest - 1):.0f} %: photographs are made equally bright"
-    return tuple(map(_divided, train, factors)), tuple(map(_divided, test, guessed)), note
+    even = tuple(map(_divided, train, factors))
+    return even, like_training(test, even), note
+
+
+def like_training(views: Sequence[View], train: Sequence[View]) -> tuple[View, ...]:
+    """Divide other photographs by the factor that the training views suggest for their cameras, if these have any."""
+    factors = [view.exposure for view in train if view.exposure is not None]
+    if not factors:
+        return tuple(views)
+    cameras = [view.camera for view in train]
+    return tuple(_divided(view, exposure_between(view.camera, cameras, torch.stack(factors))) for view in views)
 
 
 def _divided(view: View, factor: Tensor) -> View:
@@ -75,14 +83,13 @@ def exposures(views: Sequence[View], positions: Tensor) -> Tensor | None:
     return logarithms.exp()
 
 
-def exposure_at(camera: Camera, cameras: Sequence[Camera], factors: Tensor) -> Tensor:
-    """Return the factor (3,) for a camera: a geometric mean of the others', weighted by inverse squared distance.
-
-    Beside a camera that is nearly its own factor, and far from all of them 1.
-    """
+def exposure_between(camera: Camera, cameras: Sequence[Camera], factors: Tensor) -> Tensor:
+    """Return the factor (3,) for a camera from the two nearest: on the segment between them, as far as it is along."""
     positions = torch.stack([other.position for other in cameras])
-    weights = 1 / (positions - camera.position).square().sum(1).clamp_min(1e-12)
-    found: Tensor = torch.exp(weights / weights.sum() @ factors.log())
+    first, second = (positions - camera.position).norm(dim=1).topk(2, largest=False).indices.tolist()
+    along = positions[second] - positions[first]
+    share = float(((camera.position - positions[first]) @ along / along.square().sum().clamp_min(1e-12)).clamp(0, 1))
+    found: Tensor = factors[first] ** (1 - share) * factors[second] ** share
     return found
 
 
