@@ -18,7 +18,7 @@ __all__ = ["exposure_between", "exposures", "like_training", "with_one_exposure"
 _CELL = 8  # pixels: of points in one cell of a picture the nearest hide the others
 _NEAR = 1.03  # points up to so many times as far as the nearest of their cell are seen
 _INSIDE = 0.05, 0.95  # colors between which a photograph tells by how much it is brighter
-_LEAST = 100  # points that two photographs must share
+_MIN_SHARED = 100  # points that two photographs must share
 _COMMON = 0.9  # so many of these points must be brighter in the same photograph; shading and gloss change some
 
 
@@ -65,7 +65,7 @@ def exposures(views: Sequence[View], positions: Tensor) -> Tensor | None:
     rows, ratios, weights, common = [torch.ones(len(views))], [torch.zeros(3)], [0.0], False
     for (i, (a, in_a)), (j, (b, in_b)) in itertools.combinations(enumerate(seen), 2):
         both = in_a & in_b
-        if int(both.sum()) < _LEAST:
+        if int(both.sum()) < _MIN_SHARED:
             continue
         ratio = (b[both] / a[both]).log()
         brighter = (ratio > 0).float().mean(0)
