@@ -28,7 +28,17 @@ from benchmarks.setting import (
 )
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
-__all__ = ["BY_DEFAULT", "CHOICES", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "pairs_of", "tables"]
+__all__ = [
+    "BY_DEFAULT",
+    "CHOICES",
+    "SHARPER",
+    "SLOWER_MEANS",
+    "Choice",
+    "from_same_start",
+    "gains_of",
+    "pairs_of",
+    "tables",
+]
 
 
 @dataclass(frozen=True)
@@ -71,6 +81,8 @@ CHOICES = {
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
+SHARPER = {LATER: "recipe", f"{LATER} + {_SHAPES[1]}": _SHAPES[1]}
+"""The judgement of the ninth choice, likewise."""
 BY_DEFAULT = {"plain": "plain", LATER: "recipe"}
 """What the recipe gains from the start that a user has, for `from_same_start`."""
 
@@ -78,7 +90,7 @@ BY_DEFAULT = {"plain": "plain", LATER: "recipe"}
 def tables(rows: Sequence[Row]) -> list[str]:
     """Return all tables of the later choices."""
     gained = [gains_of(rows, choice) for choice in CHOICES.values()]
-    return [*gained, *(from_same_start(rows, titles) for titles in (SLOWER_MEANS, BY_DEFAULT))]
+    return [*gained, *(from_same_start(rows, titles) for titles in (SLOWER_MEANS, SHARPER, BY_DEFAULT))]
 
 
 def gains_of(rows: Sequence[Row], choice: Choice) -> str:
