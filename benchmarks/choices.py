@@ -29,16 +29,8 @@ from benchmarks.setting import (
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
-    "BY_DEFAULT",
-    "CHOICES",
-    "SHARPER",
-    "SLOWER_MEANS",
-    "Choice",
-    "from_same_start",
-    "gains_of",
-    "pairs_of",
-    "tables",
-]
+    "BY_DEFAULT", "CHOICES", "SHARPER", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "pairs_of", "tables"
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
