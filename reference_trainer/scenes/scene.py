@@ -36,7 +36,7 @@ class Viewpoint:
 class View(Viewpoint):
     """One photograph with its camera, both of one size."""
 
-    image: Tensor  # colors in [0, 1], shape (3, H, W), float32, already composited on the scene's background
+    image: Tensor  # colors in [0, 1], shape (3, H, W), float32, composited on the background; over 1 by an exposure
     alpha: Tensor | None = None  # coverage in [0, 1], shape (H, W), if the source has one
     depth: Tensor | None = None  # true depth along the camera's z axis, shape (H, W), if known; 0 where nothing is hit
     mask: Tensor | None = None  # what counts in an evaluation, in [0, 1], shape (H, W); it is not applied to the image
