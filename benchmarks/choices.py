@@ -29,7 +29,8 @@ from benchmarks.setting import (
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
-    "BY_DEFAULT", "CHOICES", "SHARPER", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "pairs_of", "tables"
+    "BESIDE_DROPOUT", "BY_DEFAULT", "CHOICES", "SHARPER", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "pairs_of",
+    "tables",
 ]  # fmt: skip
 
 
@@ -75,6 +76,8 @@ SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
 SHARPER = {LATER: "recipe", f"{LATER} + {_SHAPES[1]}": _SHAPES[1]}
 """The judgement of the ninth choice, likewise."""
+BESIDE_DROPOUT = {"dropout": "dropout alone", LATER: "recipe"}
+"""The recipe beside dropout alone, from the start that a user has."""
 BY_DEFAULT = {"plain": "plain", LATER: "recipe"}
 """What the recipe gains from the start that a user has, for `from_same_start`."""
 
@@ -82,7 +85,7 @@ BY_DEFAULT = {"plain": "plain", LATER: "recipe"}
 def tables(rows: Sequence[Row]) -> list[str]:
     """Return all tables of the later choices."""
     gained = [gains_of(rows, choice) for choice in CHOICES.values()]
-    return [*gained, *(from_same_start(rows, titles) for titles in (SLOWER_MEANS, SHARPER, BY_DEFAULT))]
+    return [*gained, *(from_same_start(rows, titles) for titles in (SLOWER_MEANS, SHARPER, BY_DEFAULT, BESIDE_DROPOUT))]
 
 
 def gains_of(rows: Sequence[Row], choice: Choice) -> str:
