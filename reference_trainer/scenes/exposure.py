@@ -95,9 +95,10 @@ def exposure_between(camera: Camera, cameras: Sequence[Camera], factors: Tensor)
 
 def _colors(view: View, positions: Tensor) -> tuple[Tensor, Tensor]:
     """Return the colors of the points in a photograph, (M, 3), and which it shows, neither dark nor burnt out."""
-    x, y, depths = _project(view.camera, positions)
-    width, height = view.camera.width, view.camera.height
-    inside = (depths > 0) & (x > 1) & (x < width - 1) & (y > 1) & (y < height - 1)
+    camera, width, height = view.camera, view.camera.width, view.camera.height
+    pixels, depths = camera.project(positions)
+    inside = camera.inside(pixels, depths)
+    x, y = pixels.unbind(1)
     columns = -(-width // _CELL)
     cells = torch.where(inside, (y / _CELL).long() * columns + (x / _CELL).long(), 0)
     far = torch.where(inside, depths, torch.inf)
@@ -105,14 +106,7 @@ def _colors(view: View, positions: Tensor) -> tuple[Tensor, Tensor]:
     # A mean over neighbors: a point that is half a pixel off would meet another color at every edge.
     smooth = avg_pool2d(view.image[None], 3, stride=1, padding=1, count_include_pad=False)
     grid = torch.stack([2 * x / width - 1, 2 * y / height - 1], 1)[None, None]
-    colors = grid_sample(smooth, grid, align_corners=False)[0, :, 0].T
+    colors = grid_sample(smooth, grid, padding_mode="border", align_corners=False)[0, :, 0].T
     low, high = _INSIDE
     shown = inside & (depths <= _NEAR * nearest[cells]) & (colors > low).all(1) & (colors < high).all(1)
     return colors, shown
-
-
-def _project(camera: Camera, positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the pixel coordinates and depths of points."""
-    pose = camera.world_to_camera.to(positions)
-    x, y, depths = (positions @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-    return camera.fx * x / depths + camera.cx, camera.fy * y / depths + camera.cy, depths
