@@ -47,7 +47,7 @@ _TYPES |= {f"rate{i}": "fp32" for i in range(6)}
 class Kernel:
     """A kernel with the constants and warps of one of its uses; ``walks`` whether it walks over lists.
 
-    ``types`` are those of arguments that differ from use to use, ``registers`` the most on NVIDIA's cards.
+    ``types`` are those of arguments that differ from use to use.
     """
 
     label: str
@@ -56,7 +56,6 @@ class Kernel:
     warps: int = 1
     walks: bool = True
     types: Mapping[str, str] = field(default_factory=dict)
-    registers: int | None = None
 
 
 @dataclass(frozen=True)
@@ -73,8 +72,7 @@ class Compiled:
 
 
 def _tiled(label: str, function: Any, columns: int, tile: int = 8, warps: int = 1, **constants: Any) -> Kernel:
-    registers = 64 if warps > 4 else None  # see `over_tiles`
-    return Kernel(label, function, {"STRIDE": columns, "TILE": tile, **constants}, warps, registers=registers)
+    return Kernel(label, function, {"STRIDE": columns, "TILE": tile, **constants}, warps)
 
 
 def _projection(bands: int) -> list[Kernel]:
@@ -149,8 +147,8 @@ def compile_ahead(kernel: Kernel, target: str, **options: Any) -> Compiled:
     types = _TYPES | dict.fromkeys(kernel.constants, "constexpr") | kernel.types
     signature = {name: types.get(name, "*fp32") for name in names}
     options = {"num_warps": kernel.warps, "enable_fp_fusion": True} | options
-    if kernel.registers is not None and TARGETS[target].backend == "cuda":
-        options = {"maxnreg": kernel.registers} | options
+    if kernel.walks and TARGETS[target].backend == "cuda":
+        options = tiles.nvidia_options(kernel.warps) | options
     source = ASTSource(fn=kernel.function, signature=signature, constexprs=kernel.constants)
     code = triton.compile(source, target=TARGETS[target], options=options).asm
     registers, shared, spills, rows = measure_nvidia(code["cubin"]) if "cubin" in code else _measure_amd(code["amdgcn"])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from reference_trainer.render.constants import MIN_ALPHA, TILE
 from reference_trainer.render.splats import Projected, TileCounts, TileLists
-from reference_trainer.render.triton.tiles import launch
+from reference_trainer.render.triton.tiles import ENTRIES, SEEN, launch
 
 __all__ = ["bin_gaussians", "count_tiles"]
 
@@ -36,15 +36,15 @@ def list_tiles(
     """Count the tiles of Gaussians and add them up, or list them, nearest first, each from ``ends - counts`` on.
 
     Both by the same machine code: two compilations could contract products and sums differently, and a tile on the
-    boundary of an ellipse be counted and not listed. The last two of the 20 numbers are how many Gaussians are in view,
-    which the processor does not know when they are counted, and the sum of their tiles.
+    boundary of an ellipse be counted and not listed. How many Gaussians are in view stands in the numbers, because the
+    processor does not know it when they are counted.
 
     Within a row of tiles, the pixel centers from dy = upper to lower, an ellipse |(l11 dx + l21 dy, l22 dy)|^2 < limit
     reaches furthest to the right at its tip, dy = xy sqrt(limit / xx), or at the end of the row that is nearest to it;
     furthest to the left likewise, at -tip. So a row's tiles are an interval, exactly.
     """
     k = tl.program_id(0) * GROUP + tl.arange(0, GROUP)
-    count = tl.load(numbers + 18).to(tl.int32)
+    count = tl.load(numbers + SEEN).to(tl.int32)
     if tl.program_id(0) * GROUP >= count:
         return
     real = k < count
@@ -87,7 +87,7 @@ def list_tiles(
     if listing == 0:
         tl.store(counts + i, found, mask=real)
         tl.store(touched + i, found > 0, mask=real)
-        tl.atomic_add(numbers + 19, tl.sum(found).to(tl.float64), sem="relaxed")
+        tl.atomic_add(numbers + ENTRIES, tl.sum(found).to(tl.float64), sem="relaxed")
 
 
 def _launch(
@@ -101,13 +101,17 @@ def _launch(
     )  # fmt: skip
 
 
+def _tiles(width: int, height: int) -> int:
+    return -(-width // TILE) * -(-height // TILE)
+
+
 def _key_type(width: int, height: int) -> torch.dtype:
-    """Return the type of the number of a tile, and of how many there are."""
-    return torch.int16 if -(-width // TILE) * -(-height // TILE) < 2**15 else torch.int32
+    """Return the type of the number of a tile; signed, as it also holds how many there are."""
+    return torch.int16 if _tiles(width, height) < 2**15 else torch.int32
 
 
 def count_tiles(shapes: Sequence[Tensor], numbers: Tensor, width: int, height: int) -> TileCounts:
-    """Count the tiles that each Gaussian touches; their sum goes to the last of the numbers, see `list_tiles`.
+    """Count the tiles that each Gaussian touches; their sum goes to the numbers.
 
     The shapes are means, factors, covariances and opacities, with room for all Gaussians.
     """
@@ -133,7 +137,6 @@ def bin_gaussians(projected: Projected, width: int, height: int) -> TileLists:
     if counts.total:
         _launch(True, order, shapes, counts, ends, (keys, gaussians), width, height)
     keys, by_tile = torch.sort(keys, stable=True)
-    # Signed: the edges go up to the number of tiles itself.
-    edges = torch.arange(-(-width // TILE) * -(-height // TILE) + 1, dtype=keys.dtype, device=keys.device)
+    edges = torch.arange(_tiles(width, height) + 1, dtype=keys.dtype, device=keys.device)
     starts = torch.searchsorted(keys, edges, out_int32=True)
     return TileLists(width, height, starts, gaussians[by_tile], counts.touched)

@@ -15,7 +15,7 @@ from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.splats import Projected, Projection
 from reference_trainer.render.triton.binning import count_tiles
-from reference_trainer.render.triton.tiles import launch
+from reference_trainer.render.triton.tiles import ENTRIES, SEEN, launch
 
 __all__ = ["project"]
 
@@ -180,7 +180,7 @@ def _add_unless_finite(numbers, x):
 
 @triton.jit(do_not_specialize=["count"])
 def find_visible(means, opacities, view, background, visible, numbers, count, BLOCK: tl.constexpr):
-    """Tell who is in view; the first 18 numbers, zeros before, are those of `check_projection`."""
+    """Tell who is in view; the first numbers, zeros before, are those of `check_projection`."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     real = i < count
     opacity = tl.load(opacities + i, mask=real, other=0.0)
@@ -203,7 +203,7 @@ def index_visible(places, indices, numbers, count, BLOCK: tl.constexpr):
     place = tl.load(places + i, mask=real, other=0)
     before = tl.load(places + i - 1, mask=real & (i > 0), other=0)
     tl.store(indices + before, i.to(tl.int64), mask=place > before)
-    tl.store(numbers + (0 * i + 18), place.to(tl.float64), mask=i == count - 1)
+    tl.store(numbers + (0 * i + SEEN), place.to(tl.float64), mask=i == count - 1)
 
 
 @triton.jit
@@ -214,7 +214,7 @@ def project_forward(
 ):  # fmt: skip
     """Project and color who is in view; BANDS harmonics of the ROW given ones, or plain colors if it is 0."""
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    count = tl.load(numbers + 18).to(tl.int32)
+    count = tl.load(numbers + SEEN).to(tl.int32)
     if tl.program_id(0) * BLOCK >= count:
         return
     real = k < count
@@ -402,7 +402,7 @@ def project(
     differentiable = means, inputs["quaternions"], inputs["scales"], sh, opacities
     *given, plain = (x.detach().contiguous() for x in differentiable)
     view, count = camera.world_to_camera.detach().contiguous(), len(means)
-    numbers = torch.zeros(2 + 16 + 2, dtype=torch.float64, device=means.device)
+    numbers = torch.zeros(ENTRIES.value + 1, dtype=torch.float64, device=means.device)
     visible = torch.empty(count, dtype=torch.int32, device=means.device)
     color = view if background is None else background.detach().to(view).contiguous()  # the pose is checked anyway
     grid, block = (triton.cdiv(count, 1024),), {"warps": 4, "BLOCK": 1024}
@@ -419,10 +419,10 @@ def project(
     )  # fmt: skip
     counts = count_tiles([*outputs[:3], outputs[5]], numbers, camera.width, camera.height)
     read = numbers.cpu()  # the one wait for the card
-    seen = int(read[18])
+    seen = int(read[SEEN.value])
     indices, *outputs = (x[:seen] for x in (indices, *outputs))
     *found, colors, shown = _Project.apply(  # type: ignore[no-untyped-call]
         *differentiable, outputs, [indices, *given, view], (camera.fx, camera.fy, of_x, of_y), constants
     )
-    counts = counts._replace(each=counts.each[:seen], touched=counts.touched[:seen], total=int(read[19]))
-    return Projected(indices, Projection(*found), shown, colors, read[:18], counts)
+    counts = counts._replace(each=counts.each[:seen], touched=counts.touched[:seen], total=int(read[ENTRIES.value]))
+    return Projected(indices, Projection(*found), shown, colors, read[: SEEN.value], counts)

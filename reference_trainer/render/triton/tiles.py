@@ -20,12 +20,17 @@ from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
 from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = [
-    "FAINT", "LAUNCHED", "ROW", "Lists", "add_row", "alpha_at", "fill_table", "geometry_sums", "gradient_rows",
-    "launch", "load3", "make_row", "make_table", "over_tiles", "pixels", "store3", "sum_rows",
+    "ENTRIES", "FAINT", "LAUNCHED", "ROW", "SEEN", "Lists", "add_row", "alpha_at", "fill_table", "geometry_sums",
+    "gradient_rows", "launch", "load3", "make_row", "make_table", "nvidia_options", "over_tiles", "pixels", "store3",
+    "sum_rows",
 ]  # fmt: skip
 
 ROW = tl.constexpr(16)
 """Columns of a row of gradients: 64 bytes, so that the sums of an entry leave in one atomic instruction."""
+
+SEEN, ENTRIES = tl.constexpr(18), tl.constexpr(19)
+"""Where the numbers of a projection, of which the first 18 are checked, hold how many Gaussians are in view and the sum
+of their tiles: all that the processor waits for."""
 
 FAINT = tl.constexpr(math.log2(MIN_ALPHA))
 """Binary logarithm of the alpha below which a splat is skipped."""
@@ -74,17 +79,22 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 1, 
             kernel[grid](*arguments, num_warps=warps, enable_fp_fusion=True, **constants)
 
 
+def nvidia_options(warps: int) -> dict[str, int]:
+    """Return what the kernels of a tile are compiled with on NVIDIA's cards.
+
+    Many warps may take 64 registers: left to itself, the assembler gives eight 48 on Ampere's and Ada's smaller cards,
+    and spills.
+    """
+    return {"maxnreg": 64} if warps > 4 else {}
+
+
 def over_tiles(
     kernel: Any, lists: Lists, table: Tensor, *arguments: Any, programs: int = 0, per_warp: int = 64, **constants: Any
 ) -> None:
-    """Start a program for every tile, or as many as told; a warp has 64 pixels, or as many as told.
-
-    On NVIDIA's cards many warps may take 64 registers: left to itself, the assembler gives eight 48 on Ampere's and
-    Ada's smaller cards, and spills.
-    """
+    """Start a program for every tile, or as many as told; a warp has 64 pixels, or as many as told."""
     warps = max(1, lists.tile**2 // per_warp)
-    if warps > 4 and torch.version.hip is None:
-        constants["maxnreg"] = 64
+    if torch.version.hip is None:
+        constants |= nvidia_options(warps)
     size = lists.width, lists.height, -(-lists.width // lists.tile)
     launch(
         kernel, (programs or lists.tiles,), table, lists.starts, lists.gaussians, *arguments, *size,
