@@ -25,7 +25,7 @@ from torch import Tensor
 
 from benchmarks.remedy import held_out
 from ca_reg.attribution import hanging
-from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.metrics import view_psnr
 from reference_trainer.evaluation.results import write_json
 from reference_trainer.evaluation.shares import blend_weights, unseen_shares
 from reference_trainer.evaluation.tables import markdown_table
@@ -117,8 +117,7 @@ def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
 @torch.no_grad()
 def quality(model: TrainedModel, view: View) -> float:
     """Return the PSNR of a view."""
-    image = view.as_taken(model.test_rendering(view).image).clamp(0, 1)
-    return psnr(image, view.as_taken(view.image), view.mask)
+    return view_psnr(model.test_rendering(view).image, view)
 
 
 @torch.no_grad()

@@ -159,11 +159,7 @@ def main(
         views = shared_views(paths[0])
         for run in paths[1:]:
             options, config = read_run_settings(run / "config.json")
-            (row,) = (
-                x
-                for x in rows_of(rows, _scene(options), candidate(config, options)).values()
-                if x["seed"] == config.seed
-            )
+            row = rows_of(rows, _scene(options), candidate(config, options))[config.seed]
             row["shared"] = fmean(quality(load_run_model(run)[0], view) for view in views)
             write_json(out, rows)
     else:

@@ -15,9 +15,11 @@ from reference_trainer.render.renderer import rasterize
 from reference_trainer.render.splats import Splats
 from reference_trainer.render.torch import compositing
 from reference_trainer.render.torch.compositing import geometry_rows, walk
+from reference_trainer.scenes.scene import View
 
 __all__ = [
-    "DepthErrors", "color_variance_map", "counted", "depth_errors", "first_order_map", "on_white", "psnr", "ssim"
+    "DepthErrors", "color_variance_map", "counted", "depth_errors", "first_order_map", "on_white", "psnr", "ssim",
+    "view_psnr",
 ]  # fmt: skip
 
 _WINDOW = 11
@@ -38,6 +40,11 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     x, y = _checked(image, target)
     error = counted((x - y).square(), mask).mean().item()
     return math.inf if error == 0 else -10 * math.log10(error)
+
+
+def view_psnr(render: Tensor, view: View) -> float:
+    """Return the PSNR of a render (3, H, W) of a view, not clamped, as its photograph was exposed, within its mask."""
+    return psnr(view.as_taken(render).clamp(0, 1), view.as_taken(view.image), view.mask)
 
 
 def counted(image: Tensor, mask: Tensor | None) -> Tensor:

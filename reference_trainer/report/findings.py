@@ -16,7 +16,7 @@ from ca_reg import CAResult, Reason
 from ca_reg.error_maps import ErrorMap
 from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.evaluate import ca_picture, error_picture, expected_error_picture
-from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.metrics import view_psnr
 from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.shares import Heat, concentration, guard
 from reference_trainer.evaluation.tables import EXACT
@@ -182,12 +182,12 @@ def pictures_of(
     model: TrainedModel, view: Viewpoint, expected: ErrorMap | None, result: CAResult | None = None
 ) -> dict[str, str]:
     """Return the pictures of a view as data URIs, and their caption."""
-    image = model.test_rendering(view).image.clamp(0, 1)
+    render = model.test_rendering(view).image
+    image = render.clamp(0, 1)
     found, said = {"render": image_uri(image)}, []
     if isinstance(view, View):
         found["error"] = heat_uri(error_picture(image, view.image))
-        pair = view.as_taken(image), view.as_taken(view.image)
-        if not math.isnan(measured := psnr(*pair, view.mask)):  # its mask may leave no pixel
+        if not math.isnan(measured := view_psnr(render, view)):  # its mask may leave no pixel
             said.append(f"PSNR {measured:.2f} dB")
     if expected is not None:
         half = avg_pool2d(expected.error[None], 2, ceil_mode=True)[0]  # it is smooth, and a third of the size

@@ -19,7 +19,7 @@ from ca_reg import CAMonitor
 from ca_reg.sinks import MLflowSink, WandbSink
 from reference_trainer.evaluation.evaluate import evaluate, training_snapshot
 from reference_trainer.evaluation.lpips import LPIPS, load_lpips
-from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.metrics import view_psnr
 from reference_trainer.evaluation.results import PARTIAL, machine, write_json
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import remove_leftovers
@@ -275,8 +275,7 @@ def _train(
         return model_of(trainer).moments(opacity, view, *rest)
 
     def quality(opacity: Tensor, view: View) -> float:  # the monitor's own test-time scaling knows only dropout
-        image = view.as_taken(model_of(trainer).test_rendering(view).image).clamp(0, 1)
-        return psnr(image, view.as_taken(view.image), view.mask)
+        return view_psnr(model_of(trainer).test_rendering(view).image, view)
 
     def details(opacity: Tensor, view: View) -> dict[str, Tensor]:
         return training_snapshot(model_of(trainer), view)

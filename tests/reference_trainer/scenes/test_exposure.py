@@ -7,7 +7,7 @@ import torch
 
 from reference_trainer.camera import Camera
 from reference_trainer.evaluation.evaluate import evaluate
-from reference_trainer.evaluation.metrics import psnr
+from reference_trainer.evaluation.metrics import psnr, view_psnr
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.scenes import load_scene
@@ -107,6 +107,7 @@ def test_quality_is_that_of_the_photograph_as_it_was_taken(scene):
     image = (model.test_rendering(view).image.detach() * factor[:, None, None]).clamp(0, 1)
     (found,) = evaluate(model, {"test": [changed]}).views
     assert found.psnr == pytest.approx(psnr(image, view.image), abs=1e-4)
+    assert view_psnr(model.test_rendering(changed).image.detach(), changed) == pytest.approx(found.psnr, abs=1e-4)
 
 
 @pytest.mark.data
