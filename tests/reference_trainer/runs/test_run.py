@@ -231,7 +231,7 @@ def test_a_damaged_plan_is_named(options, short, tmp_path, plan, error):
         pytest.param(Trainer, "train_step", 1, marks=pytest.mark.slow),
         (Trainer, "train_step", 6),
         pytest.param(Trainer, "train_step", 8, marks=pytest.mark.slow),
-        pytest.param(run_module, "psnr", 2, marks=pytest.mark.slow),  # in the middle of a measurement
+        pytest.param(run_module, "view_psnr", 2, marks=pytest.mark.slow),  # in the middle of a measurement
         pytest.param(run_module, "save_ply", 1, marks=pytest.mark.slow),
         pytest.param(run_module, "evaluate", 1, marks=pytest.mark.slow),
     ],
