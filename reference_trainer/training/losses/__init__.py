@@ -8,6 +8,7 @@ from ca_reg.registry import Registry
 from ca_reg.schedules import SCHEDULES
 from reference_trainer.training.losses.comparisons import CoAdaptation, Consistency, CoRegularization, StraightThrough
 from reference_trainer.training.losses.depth import PatchDepth, Pearson, SmoothDepth, Warp
+from reference_trainer.training.losses.distillation import Distillation
 from reference_trainer.training.losses.penalties import Alpha, Flat, Opacity, Scale
 from reference_trainer.training.losses.photometric import Photometric, Views
 from reference_trainer.training.losses.term import LossTerm
@@ -32,5 +33,6 @@ LOSSES: Registry[LossTerm] = Registry(
     consistency=Consistency,
     straight_through=StraightThrough,
     co_regularization=CoRegularization,
+    distillation=Distillation,
 )
 """The terms by name; ``LOSSES.register("name")`` adds a class."""
