@@ -36,8 +36,9 @@ class Distillation(WeightedTerm):
         lambda_dssim: weight of the structural term, in [0, 1].
 
     Raises:
-        ValueError: if there is no member; when the first step is taken, if one says that it was trained with a
-            regularizer of somebody's own module, which is not imported.
+        ValueError: when the first step is taken, if a file holds no model, or says that it was trained with somebody's
+            own regularizer, which is not imported.
+        FileNotFoundError: likewise, if there is no such file. A finished run is measured without them.
 
     Example:
         >>> from reference_trainer.training.losses import LOSSES
@@ -46,16 +47,18 @@ class Distillation(WeightedTerm):
         2
     """
 
+    analytic = True  # it renders draws of its own
+
     def __init__(self, *members: str, weight: float | Schedule = 1.0, lambda_dssim: float = 0.2) -> None:
         super().__init__(weight)
-        if not members:
-            raise ValueError("distillation needs the .ply files of the models to learn from, best of two or more.")
         check_lambda(lambda_dssim)
         self.members, self.lambda_dssim = members, lambda_dssim
-        self._models: list[TrainedModel] = []  # read at the first step: a run is measured without them
+        self._models: list[TrainedModel] = []  # read when first asked for
 
     def begin(self, scene: Scene) -> None:
-        """Choose the cameras; raises a ValueError if there are fewer than two training views."""
+        """Choose the cameras; raises a ValueError if there is no member, or fewer than two training views."""
+        if not self.members:
+            raise ValueError("distillation needs .ply files of models to learn from, best two: distillation('a.ply').")
         self.views = unseen_views(scene)
 
     def value(self, step: Step) -> Tensor:
@@ -82,4 +85,4 @@ def _member(path: str, background: Tensor) -> TrainedModel:
         if not scaled:
             raise ValueError(f"{path} does not say how it is rendered: {error} Give its PLY for viewers.") from error
     regularizer = "" if scaled else model.regularizer
-    return TrainedModel(model.gaussians.to(background.device), background, regularizer, model.step)
+    return TrainedModel(model.gaussians.map(lambda x: x.to(background)), background, regularizer, model.step)
