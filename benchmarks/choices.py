@@ -16,11 +16,13 @@ from typing import Literal
 from benchmarks.paper.rows import value
 from benchmarks.paper.scenes import SCENES
 from benchmarks.setting import (
+    DISTILLED,
     FEWEST,
     HELD_OUT,
     LATER,
     ONE_EXPOSURE,
     REFERENCES,
+    TWICE,
     Row,
     from_dense,
     references_of,
@@ -29,7 +31,7 @@ from benchmarks.setting import (
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
-    "BESIDE_DROPOUT", "BY_DEFAULT", "CHOICES", "SHARPER", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of",
+    "BESIDE_DROPOUT", "BY_DEFAULT", "CHOICES", "ENSEMBLE", "SHARPER", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of",
     "pairs_of", "tables",
 ]  # fmt: skip
 
@@ -71,6 +73,7 @@ CHOICES = {
     "ninth": Choice(_SHAPES, seeds=range(6)),
     "ninth, second round": Choice(_SHAPES, seeds=range(6), tried=(0, 1)),
     "tenth": Choice((ONE_EXPOSURE,), seeds=range(6), tried=(0, 1, 2)),
+    "eleventh": Choice((DISTILLED[2], DISTILLED[3], DISTILLED[1], TWICE), seeds=range(6), tried=(3,)),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
@@ -81,11 +84,15 @@ BESIDE_DROPOUT = {"dropout": "dropout alone", LATER: "recipe"}
 BY_DEFAULT = {"plain": "plain", LATER: "recipe"}
 """What the recipe gains from the start that a user has, for `from_same_start`."""
 
+ENSEMBLE = {"plain": "plain", f"{LATER} + {DISTILLED[2]}": DISTILLED[2]}
+"""The judgement of the eleventh choice: the seed is that of the first of two models."""
+_JUDGED = SLOWER_MEANS, SHARPER, ENSEMBLE, BY_DEFAULT, BESIDE_DROPOUT
+
 
 def tables(rows: Sequence[Row]) -> list[str]:
     """Return all tables of the later choices."""
     gained = [gains_of(rows, choice) for choice in CHOICES.values()]
-    return [*gained, *(from_same_start(rows, titles) for titles in (SLOWER_MEANS, SHARPER, BY_DEFAULT, BESIDE_DROPOUT))]
+    return [*gained, *(from_same_start(rows, titles) for titles in _JUDGED)]
 
 
 def gains_of(rows: Sequence[Row], choice: Choice) -> str:

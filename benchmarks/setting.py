@@ -103,6 +103,10 @@ DENSE = "from 1,000, dense start"
 """The same as a user has it, with the start that it has by default."""
 ONE_EXPOSURE = "one exposure"
 """What the tenth choice adds: photographs made equally bright, ``--one-exposure``."""
+DISTILLED = {1: "distilled, alone", 2: "distilled of two", 3: "distilled of three"}
+"""What the eleventh choice adds, by the number of models."""
+TWICE = "twice the steps"
+"""What takes as long as the second of these."""
 SEEDS = 5
 """So many, from 0 on, judge the chosen one."""
 FEWEST = 3
@@ -190,6 +194,8 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
     """
     if options is not None and options.one_exposure:
         return f"{candidate(config)} + {ONE_EXPOSURE}"
+    if "distillation(" in config.loss:
+        return f"{LATER} + {DISTILLED[config.loss.count('.ply')]}"
     begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
     if config.analytic:
         return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
@@ -201,7 +207,7 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
             for name, (x, value) in values.items()
             if (value in x if isinstance(x, str) else x in value if isinstance(value, tuple) else x == value)
         ]
-        return " + ".join(changes) or CHOSEN
+        return " + ".join([*changes, *[TWICE] * (config.iterations == 6_000)]) or CHOSEN
     if "warp" in config.loss:
         return "Binocular3DGS" + (", dropout" if config.dropout else "")
     name = "dropout" if config.dropout else "noise" if config.noise else "plain"
@@ -426,6 +432,8 @@ def controls(rows: Sequence[Row], references: Path = REFERENCES) -> str:
 
 def _scene(options: SceneOptions) -> str:
     """Return the name of a scene, with its points where these are others than the scene's own."""
+    if options.init is not None:  # one of the models that are distilled
+        options, _ = read_run_settings(Path(options.init).with_name("config.json"))
     start = STARTS.get(options.points)
     return Path(options.path).name + (f", {start}" if start else "")
 
@@ -437,7 +445,7 @@ def from_dense(scene: str) -> str:
 
 def _is_second(candidate: str) -> bool:
     names = set(candidate.split(" + "))
-    return names <= _SECOND.keys() or ONE_EXPOSURE in names
+    return names <= _SECOND.keys() or bool(names & {ONE_EXPOSURE, TWICE, *DISTILLED.values()})
 
 
 def rows_of(rows: Sequence[Row], scene: str, name: str) -> dict[int, Row]:

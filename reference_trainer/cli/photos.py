@@ -11,7 +11,7 @@ import sys
 import webbrowser
 from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -48,6 +48,7 @@ _WRITTEN: dict[Step, tuple[str, ...]] = {
         run.GUARD_PICTURE,
         "ca.jsonl",
         "events.out.*",
+        run.MEMBERS,
     ),
     "evaluate": (run.RESULTS, "evaluation.partial.json", run.VIEWS),
     "report": ("report.html",),
@@ -59,6 +60,8 @@ _TRAINING, _SHOWN, _MATCHED, _REFERENCE = 2.0, 30.0, 115.0, 2.9e-7
 """Of `_forecast`: a training step, measuring and showing a view, and a photograph of the dense start if it is matched
 at the size of the training, all in timed steps; seconds of such a step per pixel on the machine on which the seconds of
 the poses were measured."""
+_DISTILLED = 900
+"""A distillation's 300 steps, in steps of a training."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,9 @@ class Run:
     """1,000 steps at a tenth of a megapixel, for a first look; by default 2,000 at a fifth."""
     quality: bool = False
     """5,000 steps at half a megapixel."""
+    members: int = 1
+    """Models of different seeds to train and to distill into one, which errs less where few photographs look; with two
+    the training takes more than twice as long."""
     again: Annotated[Step | None, tyro.conf.arg(name="from")] = None
     """Do this step and those after it again: what they wrote is deleted."""
     frames: int = 16
@@ -99,6 +105,12 @@ class Run:
         return self.out or Path("runs", self._name)
 
     @property
+    def _trained(self) -> list[Path]:
+        """The folders of the trainings with different seeds, of one the folder itself."""
+        places = [self.folder / run.MEMBERS / str(seed) for seed in range(self.members)]
+        return places if self.members > 1 else [self.folder]
+
+    @property
     def _name(self) -> str:
         """Name of the photographs, of a video without its ending."""
         place = self.photos.resolve()
@@ -109,6 +121,8 @@ class Run:
             raise FileNotFoundError(f"there is no {self.photos}: give the folder of the photographs, or a video.")
         if self.quick and self.quality:
             raise ValueError("--quick and --quality exclude each other: give one.")
+        if self.members < 1:
+            raise ValueError(f"expected at least 1 of --members, got {self.members}.")
         if self.frames < 2:
             raise ValueError(f"expected at least 2 --frames of a video, got {self.frames}.")
         if self.folder.resolve() in self.photos.resolve().parents:
@@ -122,6 +136,7 @@ class Run:
         run.report_file([self.folder])
 
     def __call__(self) -> None:
+        from reference_trainer.runs.distill import distilled
         from reference_trainer.runs.run import run_experiment
 
         self.rendering.choose(self.device)
@@ -133,7 +148,11 @@ class Run:
                 self._begin_again()
         print(self._forecast(scene, options, config), flush=True)
         self._poses(scene)
-        run_experiment(options, config, self.folder, auto=True, device=self.device, progress=True)
+        for seed, folder in enumerate(self._trained):
+            own = replace(config, seed=seed)
+            run_experiment(options, own, folder, auto=True, device=self.device, progress=True)
+        if self.members > 1:
+            run_experiment(*distilled(self._trained), self.folder, device=self.device, progress=True)
         self._report()
 
     def _photographs(self) -> Path:
@@ -246,6 +265,7 @@ class Run:
 
     def _settings(self, scene: Path) -> tuple[SceneOptions, TrainConfig]:
         """Return what is trained; refuses to go on with a run that was begun with other settings, which are named."""
+        from reference_trainer.runs.distill import distilled
         from reference_trainer.scenes.images import path_inside
 
         cloud, written = path_inside(scene, self.points), "sparse/0"  # by the poses
@@ -257,9 +277,14 @@ class Run:
             str(scene), test=self.test, points=self.points, downscale=round(factor, 3), one_exposure=self.one_exposure
         )
         config = with_recipe(RECIPE, iterations=steps)
-        if (self.folder / run.CONFIG).exists() and self.again not in ("poses", "train"):
+        if self.again not in ("poses", "train"):
             try:
-                run.settings_of_run(self.folder, options, config, auto=True, given=())
+                if begun := (self._trained[0] / run.CONFIG).exists():
+                    run.settings_of_run(self._trained[0], options, config, auto=True, given=())
+                if self.members > 1 and (self.folder / run.CONFIG).exists():
+                    if not begun:
+                        raise ValueError(f"{self.folder} holds one model of its own: give another --out.")
+                    run.settings_of_run(self.folder, *distilled(self._trained), auto=False, given=())
             except ValueError as error:
                 raise ValueError(f"{error} Or train again with --from train.") from error
         return options, config
@@ -279,9 +304,12 @@ class Run:
 
         if (self.folder / run.RESULTS).exists():
             return "Trained and measured before."
-        full, factor, done = self._sizes(scene), options.downscale or 1.0, 0
-        if (self.folder / run.CHECKPOINT).exists():
-            done = load_checkpoint(self.folder / run.CHECKPOINT)["step"]
+        full, factor, begun = self._sizes(scene), options.downscale or 1.0, list[int]()
+        for folder in self._trained:
+            begun += [load_checkpoint(folder / run.CHECKPOINT)["step"]] if (folder / run.CHECKPOINT).exists() else []
+        steps, measured = config.iterations * self.members - sum(begun), 1
+        if self.members > 1:  # the last training is of steps that render several models
+            steps, measured = steps + _DISTILLED, self.members + 1
         sizes = {path: (max(1, round(w / factor)), max(1, round(h / factor))) for path, (w, h) in full.items()}
         count, usual = len(sizes), _usual(sizes.values())
         pixels = statistics.fmean(map(math.prod, sizes.values()))
@@ -292,10 +320,11 @@ class Run:
             megapixels = sum(math.prod(feature_size(*size, few=count < FEW)) for size in full.values()) / 1e6
             work = megapixels * (10.0 if count < FEW else 2.0) + 0.025 * count * (count - 1) / 2
             times["poses"] = core / (_REFERENCE * pixels) * work
-        if not done and self._makes_dense_start(options, count, posed=posed):
-            times["points"] = core * _MATCHED * sum(math.prod(matched_size(*size)) for size in sizes.values()) / pixels
-        times["training"] = step * _TRAINING * (config.iterations - done)
-        times["scores and page"] = step * _SHOWN * 3 * min(count, 8)
+        if (new := self.members - len(begun)) and self._makes_dense_start(options, count, posed=posed):
+            matched = sum(math.prod(matched_size(*size)) for size in sizes.values())
+            times["points"] = new * core * _MATCHED * matched / pixels
+        times["training"] = step * _TRAINING * steps
+        times["scores and page"] = measured * step * _SHOWN * 3 * min(count, 8)
         parts = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in times.items())
         ratios = {path: math.prod(size) / math.prod(usual) for path, size in sizes.items()}
         far = [f"{path.name} at {w}x{h}" for path, (w, h) in sizes.items() if not 1 / FAR <= ratios[path] <= FAR]

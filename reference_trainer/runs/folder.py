@@ -21,9 +21,10 @@ from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig, saved_config
 
 __all__ = [
-    "BAKED_PLY", "CHECKPOINT", "COMPARISON", "CONFIG", "GUARD", "GUARD_PICTURE", "LOCK", "PLAN", "PLY", "RESULTS",
-    "SCENE", "VIEWS", "FolderInUseError", "check_output", "check_run", "check_trusted", "folder_name", "modules_named",
-    "read_results", "read_run_settings", "report_file", "run_lock", "run_settings", "runs_of", "settings_of_run",
+    "BAKED_PLY", "CHECKPOINT", "COMPARISON", "CONFIG", "GUARD", "GUARD_PICTURE", "LOCK", "MEMBERS", "PLAN", "PLY",
+    "RESULTS", "SCENE", "VIEWS", "FolderInUseError", "check_output", "check_run", "check_trusted", "folder_name",
+    "modules_named", "read_results", "read_run_settings", "report_file", "run_lock", "run_settings", "runs_of",
+    "settings_of_run",
 ]  # fmt: skip
 
 CONFIG = "config.json"
@@ -37,6 +38,7 @@ VIEWS = "views"  # here and in the folder of an evaluation
 RESULTS = "results.json"
 COMPARISON = "comparison.json"  # of several runs
 SCENE = "scene"  # where `ca-reg run` puts photographs that have no cameras, in a folder of their name
+MEMBERS = "members"  # where it puts runs that it distills into one
 
 _OWN_PAGE = b'<meta name="generator" content="ca-reg report">'  # near the beginning of report/page.html
 _CODE = ("regularizer", "loss", "density", "renderer", "format")  # settings that may name a module:Class
@@ -60,8 +62,8 @@ def run_settings(options: SceneOptions, config: TrainConfig) -> dict[str, Any]:
 def read_run_settings(path: str | Path) -> tuple[SceneOptions, TrainConfig]:
     """Return the scene and the training of a run from its ``config.json``.
 
-    Settings that the file lacks, because an older version wrote it, take their defaults. A scene that `ca-reg run` has
-    put into the folder of the run is found there, wherever that has been moved.
+    Settings that the file lacks, because an older version wrote it, take their defaults. A scene and models that
+    `ca-reg run` has put into the folder of the run are found there, wherever that has been moved.
 
     Raises:
         ValueError: if the file is not a run's ``config.json``, or holds an unknown or invalid setting.
@@ -79,10 +81,16 @@ def read_run_settings(path: str | Path) -> tuple[SceneOptions, TrainConfig]:
     if not isinstance(content, dict) or not {"scene", "config"} <= content.keys():
         raise ValueError(f"{path} is not the config.json of a run: it must hold the objects 'scene' and 'config'.")
     scene = settings_from(SceneOptions, content["scene"], f"{path}, scene")
-    place = Path(scene.path)
-    if place.parent.name == SCENE and (own := Path(path).parent / SCENE / place.name).is_dir():
+    config = saved_config(content["config"], f"{path}, config")
+    place, here = Path(scene.path), Path(path).parent
+    run = here.parents[1] if here.parent.name == MEMBERS else here
+    if place.parent.name == SCENE and (own := run / SCENE / place.name).is_dir():
         scene = dataclasses.replace(scene, path=str(own))
-    return scene, saved_config(content["config"], f"{path}, config")
+    if scene.init and Path(scene.init).parts[-3:-2] == (MEMBERS,) and (here / MEMBERS).is_dir():
+        before, now = (folder.as_posix() for folder in (Path(scene.init).parents[2], here.resolve()))
+        scene = dataclasses.replace(scene, init=scene.init.replace(before, now))
+        config = dataclasses.replace(config, loss=config.loss.replace(before, now))
+    return scene, config
 
 
 def settings_of_run(

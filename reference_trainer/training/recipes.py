@@ -141,6 +141,20 @@ RECIPES: dict[str, Recipe] = {
         "no publication: 3dgs densified later, dropout (Chen et al. 2025), Binocular3DGS's opacity decay, our guard",
         "nothing; benchmarks/setting.md says how it was chosen",
     ),
+    "distilled": Recipe(
+        TrainConfig(
+            iterations=300,
+            means_rate=1.6e-5,
+            densify_every=0,
+            opacity_reset_every=0,
+            guard=300,
+            dropout=0.2,
+        ),
+        "no publication: a model of sparse trained on, to show what several of other seeds show in the mean",
+        "nothing; benchmarks/setting.md says what it gains",
+        "a model to start from (--init), and a loss that names all models: photometric + distillation('A.ply', "
+        "'B.ply')",
+    ),
 }
 """All recipes, by the name that ``--recipe`` knows."""
 

@@ -19,9 +19,11 @@ from reference_trainer.evaluation.pictures import save_png
 from reference_trainer.render import engine
 from reference_trainer.report import page as page_module
 from reference_trainer.runs import warmup
+from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.run import load_run
 from reference_trainer.scenes import photographs, poses, synthetic_scene
 from reference_trainer.scenes.images import read_image
+from reference_trainer.training.losses import LOSSES
 
 SCENE = synthetic_scene(width=40, height=30, points=150)
 
@@ -161,6 +163,37 @@ def test_a_run_that_is_moved_takes_its_photographs_along(garden, tmp_path, capsy
     shutil.rmtree(moved / "scene")
     assert load_run(tmp_path / "copy").scene.train[0].name.startswith("train_0")
     assert "which is not there anymore" in refused(["render", "on another disk", "--what", "train"], capsys)
+
+
+@pytest.mark.slow
+def test_models_of_several_seeds_become_one(garden, tmp_path, capsys, monkeypatch):
+    """What is finished stays where it is moved to, and another number of models is refused before anything is done."""
+    command = ["run", "garden", "--out", "out", "--no-open"]
+    main([*command, "--members", "2", "--quick"])
+    out = tmp_path / "out"
+    members = [load_run(out / "members" / str(seed)) for seed in (0, 1)]
+    assert [member.config.seed for member in members] == [0, 1]
+    assert not members[0].gaussians.means.equal(members[1].gaussians.means)
+    options, config = read_run_settings(out / "config.json")
+    (_, term) = LOSSES.make(config.loss)
+    assert term.members == tuple(str(out / "members" / str(seed) / "point_cloud.ply") for seed in (0, 1))
+    assert (options.init, config.dropout) == (term.members[0], 0.2)
+    finished = load_run(out)
+    assert finished.step == 300
+    assert not finished.gaussians.means.equal(members[0].gaussians.means)
+
+    before = seen(out)
+    for wrong in (["--members", "3", "--quick"], ["--members", "2"], ["--quick"]):
+        assert "--from train" in refused([*command, *wrong], capsys), wrong
+    assert seen(out) == before
+    moved = out.rename(tmp_path / "moved")
+    before = seen(moved)
+    main(["run", "garden", "--out", "moved", "--no-open", "--members", "2", "--quick"])
+    assert seen(moved) == before
+    assert load_run(moved).step == 300
+    main(["run", "garden", "--out", "moved", "--no-open", "--quick", "--from", "train"])
+    assert not (moved / "members").exists()
+    assert "one model" in refused(["run", "garden", "--out", "moved", "--members", "2", "--quick"], capsys)
 
 
 @pytest.mark.slow

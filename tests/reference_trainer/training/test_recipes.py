@@ -95,9 +95,14 @@ def sparse(white: bool) -> Iterator[Event]:  # ours: fsgs at three tenths but la
             yield iteration, "reset", 0.05
 
 
+def distilled(white: bool) -> Iterator[Event]:  # ours: nothing is made or removed
+    yield from ()
+
+
 CODE_BASES = {
     "3dgs": fsgs, "inria": inria, "fsgs": fsgs, "dngaussian": dngaussian, "binocular": binocular, "mvgs": inria,
     "absgs": absgs, "corgs": corgs, "segs": corgs, "sparse": sparse,
+    "distilled": distilled,
 }  # fmt: skip
 
 
