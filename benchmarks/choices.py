@@ -31,8 +31,8 @@ from benchmarks.setting import (
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
-    "BESIDE_DROPOUT", "BY_DEFAULT", "CHOICES", "ENSEMBLE", "SHARPER", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of",
-    "pairs_of", "tables",
+    "BESIDE_DROPOUT", "BY_DEFAULT", "CHOICES", "ENSEMBLE", "SHARPER", "SLOWER_MEANS", "Choice", "from_same_start",
+    "gains_of", "pairs_of", "tables",
 ]  # fmt: skip
 
 

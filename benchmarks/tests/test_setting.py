@@ -7,6 +7,10 @@ import re
 from pathlib import Path
 
 from benchmarks import setting
+from reference_trainer.evaluation.results import write_json
+from reference_trainer.runs.distill import distilled
+from reference_trainer.runs.folder import run_settings
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.recipes import with_recipe
 
 
@@ -109,6 +113,18 @@ def test_a_rate_of_the_means_by_pixels_is_another_on_every_scene():
         setting.candidate(with_recipe("sparse", iterations=3_000, means_rate=rate)) for rate in (6.4e-4, 2.5e-4, 5e-4)
     ]
     assert names == [f"from 1,000 + means {how}" for how in ("x4", "by pixels", "by pixels")]
+
+
+def test_a_distillation_is_named_by_the_number_of_its_models(tmp_path):
+    (run := tmp_path / "run").mkdir()
+    scene = SceneOptions("fern", points="dense_and_few.ply")
+    write_json(run / "config.json", run_settings(scene, with_recipe("sparse")))
+    for count, name in enumerate(("distilled, alone", "distilled of two", "distilled of three"), 1):
+        members = ", ".join([repr(str(run / "point_cloud.ply"))] * count)
+        options, config = distilled([run] * count)
+        assert config.loss == f"photometric + distillation({members})"
+        assert setting.candidate(config, options) == f"from 1,000 + {name}"
+    assert setting.candidate(with_recipe("sparse", iterations=6_000)) == "from 1,000 + twice the steps"
 
 
 def test_a_warp_is_named_by_what_it_leaves_out():

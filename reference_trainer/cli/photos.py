@@ -60,7 +60,7 @@ _TRAINING, _SHOWN, _MATCHED, _REFERENCE = 2.0, 30.0, 115.0, 2.9e-7
 """Of `_forecast`: a training step, measuring and showing a view, and a photograph of the dense start if it is matched
 at the size of the training, all in timed steps; seconds of such a step per pixel on the machine on which the seconds of
 the poses were measured."""
-_DISTILLED = 900
+_DISTILLED = 1_100
 """A distillation's 300 steps, in steps of a training."""
 
 

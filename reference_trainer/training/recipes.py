@@ -149,11 +149,11 @@ RECIPES: dict[str, Recipe] = {
             opacity_reset_every=0,
             guard=300,
             dropout=0.2,
+            loss="photometric + distillation",  # refused until the models are named
         ),
         "no publication: a model of sparse trained on, to show what several of other seeds show in the mean",
         "nothing; benchmarks/setting.md says what it gains",
-        "a model to start from (--init), and a loss that names all models: photometric + distillation('A.ply', "
-        "'B.ply')",
+        "--init A.ply --loss \"photometric + distillation('A.ply', 'B.ply')\"",
     ),
 }
 """All recipes, by the name that ``--recipe`` knows."""

@@ -14,6 +14,7 @@ from reference_trainer.runs.run import load_run, run_experiment
 from reference_trainer.scenes.virtual_cameras import unseen_views
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.losses import LOSSES
+from reference_trainer.training.recipes import with_recipe
 from reference_trainer.training.trainer import Trainer
 
 DROPPED = "dropout(0.3)"
@@ -86,6 +87,19 @@ def test_a_model_comes_to_show_what_its_teacher_shows(tiny_scene, tmp_path):
     before = likeness()
     trainer.train()
     assert likeness() > before + 10
+
+
+def test_a_resumed_distillation_is_identical(tiny_scene, tmp_path):
+    path = tmp_path / "member.ply"
+    save_ply(Trainer(tiny_scene, TrainConfig(iterations=1)).gaussians.map(torch.Tensor.detach), path)
+    config = with_recipe("distilled", iterations=8, loss=f"photometric + distillation({str(path)!r})")
+    whole, part = Trainer(tiny_scene, config), Trainer(tiny_scene, config)
+    whole.train()
+    part.train(until=3)
+    part.save(tmp_path / "checkpoint.pt")
+    again = Trainer.load(tmp_path / "checkpoint.pt", tiny_scene)
+    again.train()
+    assert all(x.equal(y) for (_, x), (_, y) in zip(whole.gaussians.named(), again.gaussians.named(), strict=True))
 
 
 def test_a_finished_run_is_measured_without_its_members(options, short, run, tmp_path):
