@@ -31,8 +31,8 @@ from benchmarks.setting import (
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
-    "BESIDE_DROPOUT", "BY_DEFAULT", "CHOICES", "ENSEMBLE", "SHARPER", "SLOWER_MEANS", "Choice", "from_same_start",
-    "gains_of", "pairs_of", "tables",
+    "BESIDE_DROPOUT", "BY_DEFAULT", "CHOICES", "ENSEMBLE", "PLAIN_ENSEMBLE", "SHARPER", "SLOWER_MEANS", "Choice",
+    "from_same_start", "gains_of", "pairs_of", "tables",
 ]  # fmt: skip
 
 
@@ -86,7 +86,9 @@ BY_DEFAULT = {"plain": "plain", LATER: "recipe"}
 
 ENSEMBLE = {"plain": "plain", f"{LATER} + {DISTILLED[2]}": DISTILLED[2]}
 """The judgement of the eleventh choice: the seed is that of the first of two models."""
-_JUDGED = SLOWER_MEANS, SHARPER, ENSEMBLE, BY_DEFAULT, BESIDE_DROPOUT
+PLAIN_ENSEMBLE = {"plain": "plain", f"plain + {DISTILLED[2]}": f"plain, {DISTILLED[2]}"}
+"""The same of plain trainings."""
+_JUDGED = SLOWER_MEANS, SHARPER, ENSEMBLE, PLAIN_ENSEMBLE, BY_DEFAULT, BESIDE_DROPOUT
 
 
 def tables(rows: Sequence[Row]) -> list[str]:

@@ -195,7 +195,7 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
     if options is not None and options.one_exposure:
         return f"{candidate(config)} + {ONE_EXPOSURE}"
     if "distillation(" in config.loss:
-        return f"{LATER} + {DISTILLED[config.loss.count('.ply')]}"
+        return f"{LATER if config.dropout else 'plain'} + {DISTILLED[config.loss.count('.ply')]}"
     begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
     if config.analytic:
         return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
