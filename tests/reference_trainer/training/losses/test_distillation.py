@@ -11,6 +11,7 @@ from reference_trainer.evaluation.metrics import psnr, ssim
 from reference_trainer.model.ply import save_ply
 from reference_trainer.render import render
 from reference_trainer.runs.run import load_run, run_experiment
+from reference_trainer.scenes import synthetic_scene
 from reference_trainer.scenes.virtual_cameras import unseen_views
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.losses import LOSSES
@@ -100,6 +101,21 @@ def test_a_resumed_distillation_is_identical(tiny_scene, tmp_path):
     again = Trainer.load(tmp_path / "checkpoint.pt", tiny_scene)
     again.train()
     assert all(x.equal(y) for (_, x), (_, y) in zip(whole.gaussians.named(), again.gaussians.named(), strict=True))
+
+
+def test_a_model_learns_on_a_card_what_it_learns_on_the_processor(card, tmp_path):
+    """Members, cameras and targets go where the model is."""
+    scene = synthetic_scene(width=20, height=15, points=30)
+    start = Trainer(scene, TrainConfig(iterations=1)).gaussians.map(torch.Tensor.detach)
+    save_ply(start, path := tmp_path / "member.ply")
+    start = dataclasses.replace(start, sh_dc=start.sh_dc + 0.5)
+    config = with_recipe("distilled", iterations=2, dropout=0.0, loss=f"distillation({str(path)!r})")
+    losses = []
+    for device in ("cpu", card):
+        trainer = Trainer(dataclasses.replace(scene, start=start), config, device)
+        losses.append([trainer.train_step() for _ in range(2)])
+    assert all(one > 0.01 for one in losses[0])
+    assert losses[1] == pytest.approx(losses[0], rel=1e-4)
 
 
 def test_a_finished_run_is_measured_without_its_members(options, short, run, tmp_path):
