@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from reference_trainer.runs.folder import CONFIG, PLY, read_run_settings
@@ -29,4 +30,4 @@ def distilled(members: Sequence[Path]) -> tuple[SceneOptions, TrainConfig]:
         sh_degree=first.sh_degree,
         loss=f"photometric + distillation({', '.join(map(repr, paths))})",
     )
-    return SceneOptions(**{**vars(options), "init": paths[0], "points": "auto"}), config
+    return replace(options, init=paths[0], points="auto"), config

@@ -11,7 +11,7 @@ from ca_reg.regularizers import parse
 from ca_reg.schedules import Schedule
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.ply import load_ply
-from reference_trainer.scenes.scene import Scene, Viewpoint
+from reference_trainer.scenes.scene import Scene
 from reference_trainer.scenes.virtual_cameras import unseen_views
 from reference_trainer.training.losses.photometric import check_lambda, photometric_loss
 from reference_trainer.training.losses.term import WeightedTerm
@@ -67,7 +67,7 @@ class Distillation(WeightedTerm):
         self._models = self._models or [_member(path, step.background) for path in self.members]
         generator = step.generator("distillation")
         number = int(torch.randint(len(self.views), (), generator=generator, device=device))
-        view = Viewpoint(self.views[number].name, self.views[number].camera.to(device))
+        view = self.views[number].to(device)
         with torch.no_grad():
             shown = [replace(each, background=step.background).test_rendering(view).image for each in self._models]
         params = step.regularizer.regularize(step.gaussians.params(view.camera, step=step.number), generator)
@@ -79,10 +79,10 @@ def _member(path: str, background: Tensor) -> TrainedModel:
     """Return a model as it is rendered at test time."""
     model = load_ply(path)
     scaled = model.for_rendering or model.opacity_scale != 1
-    try:
-        parse(model.regularizer, imports=False)
-    except ValueError as error:
-        if not scaled:
+    if not scaled:
+        try:
+            parse(model.regularizer, imports=False)
+        except ValueError as error:
             raise ValueError(f"{path} does not say how it is rendered: {error} Give its PLY for viewers.") from error
-    regularizer = "" if scaled else model.regularizer
-    return TrainedModel(model.gaussians.map(lambda x: x.to(background)), background, regularizer, model.step)
+    gaussians = model.gaussians.map(lambda x: x.to(background))
+    return TrainedModel(gaussians, background, model.regularizer, model.step, for_rendering=scaled)
