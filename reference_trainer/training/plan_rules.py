@@ -187,12 +187,14 @@ def regularizer_inputs(scene: Scene, config: TrainConfig) -> PlanItem:
 def unseen(scene: Scene, config: TrainConfig, device: torch.device | str = "cpu") -> PlanItem:
     """Initial Gaussians that have no pixel in a training view: they would stay as they are and fog the test views."""
     name = "Gaussians outside every view"
+    if scene.start is not None:
+        return PlanItem(name, "used", "by construction: training goes on from a model, with all that it has")
     start = initial_gaussians(scene, replace(config, initial_points="all"))
     outside = len(start) - int(seen_by_any(start, scene.train, device).sum())
     counts = f"{outside} of {len(start)} initial Gaussians have no pixel in a training view"
     if outside == 0:
         return PlanItem(name, "left out", f"by construction: {counts}")
-    return PlanItem(name, "left out", f"{counts}: no gradient ever reaches them", {"initial_points": "seen"})
+    return PlanItem(name, "left out", f"{counts}: no photograph tells of them", {"initial_points": "seen"})
 
 
 def saturated(scene: Scene, config: TrainConfig) -> PlanItem:

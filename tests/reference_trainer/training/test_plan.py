@@ -9,6 +9,7 @@ from reference_trainer.scenes.scene import PointCloud, Scene
 from reference_trainer.scenes.virtual_cameras import look_at
 from reference_trainer.training import step as step_module
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.model_state import initial_gaussians
 from reference_trainer.training.plan import Plan, PlanItem, make_plan
 from reference_trainer.training.recipes import RECIPES, with_recipe
 from reference_trainer.training.trainer import Trainer
@@ -95,10 +96,13 @@ def test_points_behind_all_cameras_are_left_out(tiny_scene):
     points = tiny_scene.points
     behind = torch.tensor([[0.0, 0.0, -40.0]]) + torch.arange(3.0)[:, None]
     both = PointCloud(torch.cat([points.positions, behind]), torch.cat([points.colors, torch.zeros(3, 3)]), "both")
-    item = items(dataclasses.replace(tiny_scene, points=both), TrainConfig())["Gaussians outside every view"]
+    scene, rule = dataclasses.replace(tiny_scene, points=both), "Gaussians outside every view"
+    item = items(scene, TrainConfig())[rule]
     assert "3 of 153" in item.reason
     assert item.changes == {"initial_points": "seen"}
-    assert not items(tiny_scene, TrainConfig())["Gaussians outside every view"].changes
+    assert not items(tiny_scene, TrainConfig())[rule].changes
+    model = dataclasses.replace(scene, start=initial_gaussians(scene, TrainConfig()))
+    assert not items(model, TrainConfig())[rule].changes  # a model is trained on as it is
 
 
 @pytest.mark.parametrize(
