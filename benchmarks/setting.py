@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -195,7 +196,7 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
     if options is not None and options.one_exposure:
         return f"{candidate(config)} + {ONE_EXPOSURE}"
     if "distillation(" in config.loss:
-        return f"{LATER if config.dropout else 'plain'} + {DISTILLED[config.loss.count('.ply')]}"
+        return f"{LATER if config.dropout else 'plain'} + {_distilled(config.loss)}"
     begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
     if config.analytic:
         return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
@@ -212,6 +213,14 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
         return "Binocular3DGS" + (", dropout" if config.dropout else "")
     name = "dropout" if config.dropout else "noise" if config.noise else "plain"
     return name + (f", {LATER}" if begins == 1_000 else "")
+
+
+def _distilled(loss: str) -> str:
+    """Return which models a loss distills: how many, or with what if they are of two kinds."""
+    runs = [Path(ply).parent for ply in re.findall(r"'([^']*\.ply)'", loss)]
+    first, *others = (candidate(read_run_settings(run / "config.json")[1]) for run in runs)
+    kinds = [other.removeprefix(f"{LATER} + ") for other in others if other != first]
+    return f"distilled with {', '.join(kinds)}" if kinds else DISTILLED[len(runs)]
 
 
 def measured(run: Path, perceptual: LPIPS | None = None) -> Row:

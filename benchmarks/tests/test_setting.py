@@ -127,6 +127,19 @@ def test_a_distillation_is_named_by_the_number_of_its_models(tmp_path):
     assert setting.candidate(with_recipe("sparse", iterations=6_000)) == "from 1,000 + twice the steps"
 
 
+def test_a_distillation_of_two_kinds_is_named_by_the_second(tmp_path):
+    for folder, of in (
+        ("recipe", with_recipe("sparse")),
+        ("slow", with_recipe("sparse", means_rate=4e-5)),
+        ("other", with_recipe("binocular", dropout=0.2)),
+    ):
+        (tmp_path / folder).mkdir()
+        write_json(tmp_path / folder / "config.json", run_settings(SceneOptions("fern", points="dense.ply"), of))
+    for folder, name in (("slow", "means x1/4"), ("other", "Binocular3DGS, dropout")):
+        options, config = distilled([tmp_path / "recipe", tmp_path / folder])
+        assert setting.candidate(config, options) == f"from 1,000 + distilled with {name}"
+
+
 def test_a_warp_is_named_by_what_it_leaves_out():
     hidden = "shift=0.15, relative=True, hidden=0.02"
     for loss, name in (
