@@ -16,13 +16,16 @@ from typing import Literal
 from benchmarks.paper.rows import value
 from benchmarks.paper.scenes import SCENES
 from benchmarks.setting import (
+    BINOCULAR,
     DISTILLED,
     FEWEST,
     HELD_OUT,
     LATER,
     ONE_EXPOSURE,
     REFERENCES,
+    RELATIVE,
     TWICE,
+    TWO_KINDS,
     Row,
     from_dense,
     references_of,
@@ -31,8 +34,8 @@ from benchmarks.setting import (
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
-    "BESIDE_DROPOUT", "BY_DEFAULT", "CHOICES", "ENSEMBLE", "PLAIN_ENSEMBLE", "SHARPER", "SLOWER_MEANS", "Choice",
-    "from_same_start", "gains_of", "pairs_of", "tables",
+    "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BY_DEFAULT", "CHOICES", "ENSEMBLE", "KINDS", "PLAIN_ENSEMBLE", "SHARPER",
+    "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "pairs_of", "tables",
 ]  # fmt: skip
 
 
@@ -74,6 +77,7 @@ CHOICES = {
     "ninth, second round": Choice(_SHAPES, seeds=range(6), tried=(0, 1)),
     "tenth": Choice((ONE_EXPOSURE,), seeds=range(6), tried=(0, 1, 2)),
     "eleventh": Choice((DISTILLED[2], DISTILLED[3], DISTILLED[1], TWICE), seeds=range(6), tried=(3,)),
+    "twelfth": Choice((DISTILLED[2], *TWO_KINDS), seeds=range(6), tried=(3,)),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
@@ -88,7 +92,14 @@ ENSEMBLE = {"plain": "plain", f"{LATER} + {DISTILLED[2]}": DISTILLED[2]}
 """The judgement of the eleventh choice: the seed is that of the first of two models."""
 PLAIN_ENSEMBLE = {"plain": "plain", f"plain + {DISTILLED[2]}": f"plain, {DISTILLED[2]}"}
 """The same of plain trainings."""
-_JUDGED = SLOWER_MEANS, SHARPER, ENSEMBLE, PLAIN_ENSEMBLE, BY_DEFAULT, BESIDE_DROPOUT
+KINDS = tuple({"plain": "plain", f"{LATER} + {name}": name} for name in (TWO_KINDS[0], TWO_KINDS[-1]))
+"""The judgement of the twelfth choice, of two models and of three."""
+BESIDE_BINOCULAR = tuple(
+    {f"{BINOCULAR}{RELATIVE}": BINOCULAR, f"{LATER} + {name}": name}
+    for name in (DISTILLED[2], TWO_KINDS[0], TWO_KINDS[-1])
+)
+"""The same and two seeds beside Binocular3DGS, from the start that a user has."""
+_JUDGED = SLOWER_MEANS, SHARPER, ENSEMBLE, PLAIN_ENSEMBLE, *KINDS, *BESIDE_BINOCULAR, BY_DEFAULT, BESIDE_DROPOUT
 
 
 def tables(rows: Sequence[Row]) -> list[str]:

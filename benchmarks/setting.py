@@ -108,6 +108,19 @@ DISTILLED = {1: "distilled, alone", 2: "distilled of two", 3: "distilled of thre
 """What the eleventh choice adds, by the number of models."""
 TWICE = "twice the steps"
 """What takes as long as the second of these."""
+BINOCULAR, RELATIVE = "Binocular3DGS, dropout", ", relative shift"
+"""The second with the shift of its warp by the distance of the cameras."""
+TWO_KINDS = tuple(
+    f"distilled with {kind}"
+    for kind in (
+        "means x1/4",
+        "D-SSIM 0.4 + threshold 7e-4",
+        "warp + hidden left out",
+        f"{BINOCULAR}{RELATIVE}",
+        "means x1/4, warp + hidden left out",
+    )
+)
+"""What the twelfth choice adds, by the kinds of the other models."""
 SEEDS = 5
 """So many, from 0 on, judge the chosen one."""
 FEWEST = 3
@@ -126,7 +139,6 @@ STARTS = {
 """Values of ``--points`` whose rows stand apart, and what they are called: files of `benchmarks.start_scenes`."""
 REFERENCES = Path(__file__).with_name("data") / "paper"
 """Folder with the rows of the paper's grid."""
-BINOCULAR = "Binocular3DGS, dropout"
 _REFERENCES: dict[str, dict[str, Any]] = {
     "plain": {},
     "dropout": {"regularizer": "dropout(0.2)"},
@@ -210,7 +222,7 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
         ]
         return " + ".join([*changes, *[TWICE] * (config.iterations == 6_000)]) or CHOSEN
     if "warp" in config.loss:
-        return "Binocular3DGS" + (", dropout" if config.dropout else "")
+        return "Binocular3DGS" + ", dropout" * bool(config.dropout) + RELATIVE * ("relative" in config.loss)
     name = "dropout" if config.dropout else "noise" if config.noise else "plain"
     return name + (f", {LATER}" if begins == 1_000 else "")
 
@@ -230,7 +242,8 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
     results = read_json(run / "results.json")
     name = Path(options.path).name
     row: Row = {"scene": _scene(options), "candidate": candidate(config, options), "seed": config.seed}
-    if (name in HELD_OUT or name.endswith("-many")) and row["candidate"].removesuffix(f", {LATER}") not in _REFERENCES:
+    compared = row["candidate"].removesuffix(f", {LATER}").removesuffix(RELATIVE) in _REFERENCES
+    if (name in HELD_OUT or name.endswith("-many")) and not compared:
         row["held-out"] = fmean(quality(model, view) for view in _held_out(options, config.seed))
     test, metric = results["mean"]["test"], results.get("perceptual_metric")
     if metric is None and perceptual is not None:
@@ -454,7 +467,7 @@ def from_dense(scene: str) -> str:
 
 def _is_second(candidate: str) -> bool:
     names = set(candidate.split(" + "))
-    return names <= _SECOND.keys() or bool(names & {ONE_EXPOSURE, TWICE, *DISTILLED.values()})
+    return names <= _SECOND.keys() or "distilled" in candidate or bool(names & {ONE_EXPOSURE, TWICE})
 
 
 def rows_of(rows: Sequence[Row], scene: str, name: str) -> dict[int, Row]:

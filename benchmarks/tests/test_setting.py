@@ -131,11 +131,11 @@ def test_a_distillation_of_two_kinds_is_named_by_the_second(tmp_path):
     for folder, of in (
         ("recipe", with_recipe("sparse")),
         ("slow", with_recipe("sparse", means_rate=4e-5)),
-        ("other", with_recipe("binocular", dropout=0.2)),
+        ("other", with_recipe("binocular", dropout=0.2, loss="photometric + warp(1.0, relative=True)")),
     ):
         (tmp_path / folder).mkdir()
         write_json(tmp_path / folder / "config.json", run_settings(SceneOptions("fern", points="dense.ply"), of))
-    for folder, name in (("slow", "means x1/4"), ("other", "Binocular3DGS, dropout")):
+    for folder, name in (("slow", "means x1/4"), ("other", "Binocular3DGS, dropout, relative shift")):
         options, config = distilled([tmp_path / "recipe", tmp_path / folder])
         assert setting.candidate(config, options) == f"from 1,000 + distilled with {name}"
 

@@ -1,17 +1,39 @@
-"""Several runs of one scene, which differ by their seeds, distilled into one model."""
+"""Several runs of one scene, of other seeds and kinds, distilled into one model."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from reference_trainer.runs.folder import CONFIG, PLY, read_run_settings
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.recipes import with_recipe
+from reference_trainer.training.recipes import RECIPES, with_recipe, with_steps
 
-__all__ = ["distilled"]
+__all__ = ["distilled", "member_settings"]
+
+_KINDS: tuple[dict[str, Any], ...] = (
+    {},
+    {"means_rate": 4e-5, "means_rate_final": 4e-7},
+    {"loss": "photometric + warp(between(1.0, 2_000), shift=0.15, relative=True, hidden=0.02)"},
+)
+"""What the members change, at the steps of ``sparse``: models of one kind share what is wrong with their kind."""
+
+
+def member_settings(config: TrainConfig, number: int) -> TrainConfig:
+    """Return the settings of a member from those of the first, number 0; benchmarks/setting.md chose the kinds.
+
+    Example:
+        >>> second, third = (member_settings(with_recipe("sparse", iterations=1_500), number) for number in (1, 2))
+        >>> second.seed, second.means_rate, third.loss
+        (1, 4e-05, 'photometric + warp(between(1.0, 1000), shift=0.15, relative=True, hidden=0.02)')
+    """
+    changes = dict(_KINDS[number % len(_KINDS)])
+    if loss := changes.get("loss"):
+        changes["loss"] = with_steps(loss, config.iterations / RECIPES["sparse"].config.iterations)
+    return replace(config, seed=config.seed + number, **changes)
 
 
 def distilled(members: Sequence[Path]) -> tuple[SceneOptions, TrainConfig]:

@@ -166,29 +166,31 @@ def test_a_run_that_is_moved_takes_its_photographs_along(garden, tmp_path, capsy
 
 
 @pytest.mark.slow
-def test_models_of_several_seeds_become_one(garden, tmp_path, capsys, monkeypatch):
+def test_models_of_several_kinds_become_one(garden, tmp_path, capsys, monkeypatch):
     """What is finished stays where it is moved to, and another number of models is refused before anything is done."""
     command = ["run", "garden", "--out", "out", "--no-open"]
-    main([*command, "--members", "2", "--quick"])
+    main([*command, "--members", "3", "--quick"])
     out = tmp_path / "out"
-    members = [load_run(out / "members" / str(seed)) for seed in (0, 1)]
-    assert [member.config.seed for member in members] == [0, 1]
+    members = [load_run(out / "members" / str(seed)) for seed in range(3)]
+    assert [member.config.seed for member in members] == [0, 1, 2]
+    assert [member.config.means_rate for member in members] == [1.6e-4, 4e-5, 1.6e-4]
+    assert ["warp" in member.config.loss for member in members] == [False, False, True]
     assert not members[0].gaussians.means.equal(members[1].gaussians.means)
     options, config = read_run_settings(out / "config.json")
     (_, term) = LOSSES.make(config.loss)
-    assert term.members == tuple(str(out / "members" / str(seed) / "point_cloud.ply") for seed in (0, 1))
+    assert term.members == tuple(str(out / "members" / str(seed) / "point_cloud.ply") for seed in range(3))
     assert (options.init, config.dropout) == (term.members[0], 0.2)
     finished = load_run(out)
     assert finished.step == 300
     assert not finished.gaussians.means.equal(members[0].gaussians.means)
 
     before = seen(out)
-    for wrong in (["--members", "3", "--quick"], ["--members", "2"], ["--quick"]):
+    for wrong in (["--members", "2", "--quick"], ["--members", "3"], ["--quick"]):
         assert "--from train" in refused([*command, *wrong], capsys), wrong
     assert seen(out) == before
     moved = out.rename(tmp_path / "moved")
     before = seen(moved)
-    main(["run", "garden", "--out", "moved", "--no-open", "--members", "2", "--quick"])
+    main(["run", "garden", "--out", "moved", "--no-open", "--members", "3", "--quick"])
     assert seen(moved) == before
     assert load_run(moved).step == 300
     main(["run", "garden", "--out", "moved", "--no-open", "--quick", "--from", "train"])
