@@ -82,8 +82,8 @@ class Run:
     quality: bool = False
     """5,000 steps at half a megapixel."""
     members: int = 1
-    """Models to train and to distill into one, which errs less where few photographs look: of other seeds, the second
-    with slower means, the third with Binocular3DGS's warp. Training takes 2.4 times as long with two, 4 with three."""
+    """Models to train and to distill into one, which errs less where few photographs look: 2, of other seeds, take 2.4
+    times as long to train as one; of 3 the second has slower means and the third Binocular3DGS's warp, 4 times."""
     again: Annotated[Step | None, tyro.conf.arg(name="from")] = None
     """Do this step and those after it again: what they wrote is deleted."""
     frames: int = 16
@@ -149,7 +149,7 @@ class Run:
         print(self._forecast(scene, options, config), flush=True)
         self._poses(scene)
         for number, folder in enumerate(self._trained):
-            own = member_settings(config, number)
+            own = member_settings(config, number, self.members)
             run_experiment(options, own, folder, auto=True, device=self.device, progress=True)
         if self.members > 1:
             run_experiment(*distilled(self._trained), self.folder, device=self.device, progress=True)
@@ -307,9 +307,9 @@ class Run:
             return "Trained and measured before."
         full, factor, new, steps, measured = self._sizes(scene), options.downscale or 1.0, 0, 0.0, 1
         for number, folder in enumerate(self._trained):
-            begun, warped = (folder / run.CHECKPOINT).exists(), "warp(" in member_settings(config, number).loss
-            done = load_checkpoint(folder / run.CHECKPOINT)["step"] if begun else 0
-            steps += (config.iterations - done) * (_WARPED if warped else 1)
+            own, begun = member_settings(config, number, self.members), (folder / run.CHECKPOINT).exists()
+            left = own.iterations - (load_checkpoint(folder / run.CHECKPOINT)["step"] if begun else 0)
+            steps += left * (_WARPED if "warp(" in own.loss else 1)
             new += not begun
         if self.members > 1:  # the last training is of steps that render several models
             steps, measured = steps + _DISTILLED, self.members + 1

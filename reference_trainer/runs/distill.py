@@ -14,23 +14,26 @@ from reference_trainer.training.recipes import RECIPES, with_recipe, with_steps
 
 __all__ = ["distilled", "member_settings"]
 
-_KINDS: tuple[dict[str, Any], ...] = (
+_THREE: tuple[dict[str, Any], ...] = (
     {},
     {"means_rate": 4e-5, "means_rate_final": 4e-7},
     {"loss": "photometric + warp(between(1.0, 2_000), shift=0.15, relative=True, hidden=0.02)"},
 )
-"""What the members change, at the steps of ``sparse``: models of one kind share what is wrong with their kind."""
+"""What three members change, at the steps of ``sparse``: models of one kind share what is wrong with their kind."""
 
 
-def member_settings(config: TrainConfig, number: int) -> TrainConfig:
+def member_settings(config: TrainConfig, number: int, of: int) -> TrainConfig:
     """Return the settings of a member from those of the first, number 0; benchmarks/setting.md chose the kinds.
 
+    Members have seeds of their own, three of them other settings as well.
+
     Example:
-        >>> second, third = (member_settings(with_recipe("sparse", iterations=1_500), number) for number in (1, 2))
+        >>> first = with_recipe("sparse", iterations=1_500)
+        >>> second, third = (member_settings(first, number, of=3) for number in (1, 2))
         >>> second.seed, second.means_rate, third.loss
         (1, 4e-05, 'photometric + warp(between(1.0, 1000), shift=0.15, relative=True, hidden=0.02)')
     """
-    changes = dict(_KINDS[number % len(_KINDS)])
+    changes = dict(_THREE[number]) if of == len(_THREE) else {}
     if loss := changes.get("loss"):
         changes["loss"] = with_steps(loss, config.iterations / RECIPES["sparse"].config.iterations)
     return replace(config, seed=config.seed + number, **changes)
