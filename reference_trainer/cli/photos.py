@@ -60,7 +60,7 @@ _TRAINING, _SHOWN, _MATCHED, _REFERENCE = 2.0, 30.0, 115.0, 2.9e-7
 """Of `_forecast`: a training step, measuring and showing a view, and a photograph of the dense start if it is matched
 at the size of the training, all in timed steps; seconds of such a step per pixel on the machine on which the seconds of
 the poses were measured."""
-_DISTILLED, _WARPED = 1_100, 1.5
+_DISTILLED, _WARPED = 1_100, 1.8
 """A distillation's 300 steps, and a step of a training with a warp in its loss, in steps of a training."""
 
 
@@ -83,7 +83,7 @@ class Run:
     """5,000 steps at half a megapixel."""
     members: int = 1
     """Models to train and to distill into one, which errs less where few photographs look: 2, of other seeds, take 2.4
-    times as long to train as one; of 3 the second has slower means and the third Binocular3DGS's warp, 4 times."""
+    times as long to train as one; of 3, 4.3 times, the second has slower means and the third Binocular3DGS's warp."""
     again: Annotated[Step | None, tyro.conf.arg(name="from")] = None
     """Do this step and those after it again: what they wrote is deleted."""
     frames: int = 16
