@@ -34,8 +34,8 @@ from benchmarks.setting import (
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
-    "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BY_DEFAULT", "CHOICES", "ENSEMBLE", "KINDS", "PLAIN_ENSEMBLE", "SHARPER",
-    "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "pairs_of", "tables",
+    "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_DEFAULT", "CHOICES", "ENSEMBLE", "KINDS", "PLAIN_ENSEMBLE",
+    "SHARPER", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "pairs_of", "tables",
 ]  # fmt: skip
 
 
@@ -92,14 +92,19 @@ ENSEMBLE = {"plain": "plain", f"{LATER} + {DISTILLED[2]}": DISTILLED[2]}
 """The judgement of the eleventh choice: the seed is that of the first of two models."""
 PLAIN_ENSEMBLE = {"plain": "plain", f"plain + {DISTILLED[2]}": f"plain, {DISTILLED[2]}"}
 """The same of plain trainings."""
-KINDS = tuple({"plain": "plain", f"{LATER} + {name}": name} for name in (TWO_KINDS[0], TWO_KINDS[-1]))
-"""The judgement of the twelfth choice, of two models and of three."""
+_SLOW, *_, _WITH_BINOCULAR, _THREE_KINDS = TWO_KINDS
+KINDS = tuple({"plain": "plain", f"{LATER} + {name}": name} for name in (_SLOW, _THREE_KINDS, _WITH_BINOCULAR))
+"""The judgement of the twelfth choice, of two models and of three, and what was not chosen."""
+BESIDE_TWO = {f"{LATER} + {name}": name for name in (DISTILLED[2], _THREE_KINDS)}
+"""Three kinds beside two seeds."""
 BESIDE_BINOCULAR = tuple(
     {f"{BINOCULAR}{RELATIVE}": BINOCULAR, f"{LATER} + {name}": name}
-    for name in (DISTILLED[2], TWO_KINDS[0], TWO_KINDS[-1])
+    for name in (DISTILLED[2], _THREE_KINDS, _WITH_BINOCULAR)
 )
-"""The same and two seeds beside Binocular3DGS, from the start that a user has."""
-_JUDGED = SLOWER_MEANS, SHARPER, ENSEMBLE, PLAIN_ENSEMBLE, *KINDS, *BESIDE_BINOCULAR, BY_DEFAULT, BESIDE_DROPOUT
+"""All these beside Binocular3DGS, from the start that a user has."""
+_JUDGED = (
+    SLOWER_MEANS, SHARPER, ENSEMBLE, PLAIN_ENSEMBLE, *KINDS, BESIDE_TWO, *BESIDE_BINOCULAR, BY_DEFAULT, BESIDE_DROPOUT,
+)  # fmt: skip
 
 
 def tables(rows: Sequence[Row]) -> list[str]:
