@@ -22,10 +22,10 @@ from benchmarks.setting import (
     HELD_OUT,
     LATER,
     ONE_EXPOSURE,
+    OTHER_KINDS,
     REFERENCES,
     RELATIVE,
     TWICE,
-    TWO_KINDS,
     Row,
     from_dense,
     references_of,
@@ -77,7 +77,7 @@ CHOICES = {
     "ninth, second round": Choice(_SHAPES, seeds=range(6), tried=(0, 1)),
     "tenth": Choice((ONE_EXPOSURE,), seeds=range(6), tried=(0, 1, 2)),
     "eleventh": Choice((DISTILLED[2], DISTILLED[3], DISTILLED[1], TWICE), seeds=range(6), tried=(3,)),
-    "twelfth": Choice((DISTILLED[2], *TWO_KINDS), seeds=range(6), tried=(3,)),
+    "twelfth": Choice((DISTILLED[2], *OTHER_KINDS), seeds=range(6), tried=(3,)),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
@@ -92,7 +92,7 @@ ENSEMBLE = {"plain": "plain", f"{LATER} + {DISTILLED[2]}": DISTILLED[2]}
 """The judgement of the eleventh choice: the seed is that of the first of two models."""
 PLAIN_ENSEMBLE = {"plain": "plain", f"plain + {DISTILLED[2]}": f"plain, {DISTILLED[2]}"}
 """The same of plain trainings."""
-_SLOW, *_, _WITH_BINOCULAR, _THREE_KINDS = TWO_KINDS
+_SLOW, *_, _WITH_BINOCULAR, _THREE_KINDS = OTHER_KINDS
 KINDS = tuple({"plain": "plain", f"{LATER} + {name}": name} for name in (_SLOW, _THREE_KINDS, _WITH_BINOCULAR))
 """The judgement of the twelfth choice, of two models and of three, and what was not chosen."""
 BESIDE_TWO = {f"{LATER} + {name}": name for name in (DISTILLED[2], _THREE_KINDS)}

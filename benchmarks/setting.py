@@ -109,8 +109,8 @@ DISTILLED = {1: "distilled, alone", 2: "distilled of two", 3: "distilled of thre
 TWICE = "twice the steps"
 """What takes as long as the second of these."""
 BINOCULAR, RELATIVE = "Binocular3DGS, dropout", ", relative shift"
-"""The second with the shift of its warp by the distance of the cameras."""
-TWO_KINDS = tuple(
+"""A setting of others, and the end of its name where the shift of its warp goes by the distance of the cameras."""
+OTHER_KINDS = tuple(
     f"distilled with {kind}"
     for kind in (
         "means x1/4",
@@ -228,7 +228,7 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
 
 
 def _distilled(loss: str) -> str:
-    """Return which models a loss distills: how many, or with what if they are of two kinds."""
+    """Return which models a loss distills: how many, or if they are of several kinds, which the others are."""
     runs = [Path(ply).parent for ply in re.findall(r"'([^']*\.ply)'", loss)]
     first, *others = (candidate(read_run_settings(run / "config.json")[1]) for run in runs)
     kinds = [other.removeprefix(f"{LATER} + ") for other in others if other != first]
