@@ -55,6 +55,8 @@ class Paper:
     """Steps of every training, to which all schedules are scaled."""
     seeds: int = 3
     """Number of seeds; a claim needs two to be judged."""
+    sequential: bool = False
+    """Train more than three seeds only of what a check compares that three leave undecided."""
     list: bool = False
     """List the trainings, with those that are kept and the time that the others may take; train nothing."""
     pages: tuple[Path, ...] = ()
@@ -79,7 +81,7 @@ class Paper:
         rows = self.rows or (self.out if own.path else Path("benchmarks/data/paper"))
         scenes = chosen_scenes(self.scenes, self.data, own)
         claims = chosen(self.claims, [*scenes] if own.path else None)
-        grid = Grid(claims, scenes, self.recipe, self.iterations, self.seeds, self.out, rows)
+        grid = Grid(claims, scenes, self.recipe, self.iterations, self.seeds, self.out, rows, self.sequential)
         store = RowStore(rows, self.recipe, self.iterations)
         for path in self.pages:
             write_text(path, page(path.read_text("utf-8"), store))

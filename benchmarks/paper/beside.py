@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from benchmarks.paper.claims import AT_PAPER_SIZE, CLAIMS, Check, Setting
-from benchmarks.paper.comparison import RowStore, differences, interval, judged
+from benchmarks.paper.comparison import FEW_SEEDS, RowStore, differences, interval, judged
 from benchmarks.paper.rows import value
 from benchmarks.paper.scenes import PAPER_SIZE, PAPER_STEPS
 from reference_trainer.evaluation.tables import markdown_table
@@ -44,7 +44,6 @@ _WAYS: Mapping[str, Setting] = {
     "dropout": {"regularizer": "dropout(0.2)"},
     "noise": {"regularizer": "noise(0.8)"},
 }
-_FEW_SEEDS = 3
 
 
 def beside_table(store: RowStore) -> str:
@@ -96,12 +95,12 @@ def sizes_table(store: RowStore) -> str:
 def seeds_table(store: RowStore) -> str:
     """Return the verdicts of three seeds and of all where there are more, in bold if they differ; "" without any."""
     columns = ["", "claim", "scene", "three seeds", "all", "seeds"]
-    few, lines = RowStore(store.folder, store.recipe, store.iterations, seeds=_FEW_SEEDS), []
+    few, lines = RowStore(store.folder, store.recipe, store.iterations, seeds=FEW_SEEDS), []
     for name, claim in CLAIMS.items():
         before = judged(claim, few) if name not in AT_PAPER_SIZE else {}
         for scene, (_, end) in judged(claim, store).items() if before else ():
             counts = [len(differences(check, scene, store)) for check in claim.checks]
-            if max(counts) > _FEW_SEEDS and scene in before:
+            if max(counts) > FEW_SEEDS and scene in before:
                 seeds = " to ".join(map(str, sorted({min(counts), max(counts)})))
                 found = end if end == before[scene][1] else f"**{end}**"
                 cells = name, claim.says, scene, before[scene][1], found, seeds

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.paper.claims import Claim, Setting
+from benchmarks.paper.comparison import FEW_SEEDS, RowStore, undecided
 from benchmarks.paper.rows import Row, Rows, config_of, label, resolved, value
 from benchmarks.paper.scenes import PaperScene
 from ca_reg.monitor import LOG_NAME
@@ -59,6 +60,7 @@ class Grid:
         seeds: number of seeds.
         out: folder for the trainings, ``NAME/LABEL/seed_K``, each removed once its row is kept.
         rows: folder of the kept rows, ``NAME.json``.
+        sequential: whether seeds beyond `FEW_SEEDS` are only for what these leave undecided.
 
     Raises:
         ValueError: if there is no seed.
@@ -71,6 +73,7 @@ class Grid:
     seeds: int = 3
     out: Path = Path("runs/paper")
     rows: Path = Path("runs/paper")
+    sequential: bool = False
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
@@ -95,10 +98,11 @@ class Cell:
 def declared(grid: Grid) -> list[Cell]:
     """Return the trainings of a grid, each once, ordered by seed, then by claim."""
     found: dict[str, Cell] = {}
+    few = RowStore(grid.rows, grid.recipe, grid.iterations, FEW_SEEDS) if grid.sequential else None
     for seed in range(grid.seeds):
         for claim in grid.claims.values():
-            for name in grid.scenes:
-                for given in claim.settings if name in claim.scenes else ():
+            for name in (each for each in grid.scenes if each in claim.scenes):
+                for given in claim.settings if few is None or seed < FEW_SEEDS else undecided(claim, name, few):
                     cell = Cell(name, resolved(given, grid.recipe, grid.iterations), seed, claim.needs)
                     known = found.get(cell.name, cell)
                     found[cell.name] = replace(cell, needs=cell.needs | known.needs)
@@ -121,6 +125,8 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
         ValueError: if a scene has no test views.
         FileNotFoundError: if there is no such scene.
     """
+    first = replace(grid, seeds=FEW_SEEDS)
+    failed = run_cells(first, running) if grid.sequential and grid.seeds > FEW_SEEDS else {}
     rows = rows_of(grid)
     left = [
         replace(cell, needs=cell.needs | EXTRAS & (_row_of(cell, rows) or {}).keys())
@@ -136,7 +142,6 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
         if not load_scene(grid.scenes[name].options).test:
             raise ValueError(f"{name} has no test views, which the claims are about: hold some out with --split llff.")
     cells = {folder_of(grid, cell): cell for cell in left}
-    failed: dict[str, Failure] = {}
 
     def keep(run: Run, results: dict[str, Any]) -> None:
         if cell := cells.get(run.out):

@@ -9,12 +9,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from benchmarks.paper.claims import CLAIMS, Check, Claim
+from benchmarks.paper.claims import CLAIMS, Check, Claim, Setting
 from benchmarks.paper.rows import Row, Rows, label, resolved, value
 from benchmarks.paper.scenes import PAPER_SIZE, SCENES
 
 __all__ = [
     "ERRORS",
+    "FEW_SEEDS",
     "Gain",
     "RowStore",
     "Verdict",
@@ -25,12 +26,15 @@ __all__ = [
     "overall",
     "ranked",
     "tested",
+    "undecided",
     "verdict",
 ]
 
 Verdict = Literal["holds", "fails", "undecided", "depends on the scene"]
 ERRORS = 2.0
 """Half the width of the interval, in standard errors of the mean over the seeds."""
+FEW_SEEDS = 3
+"""How many seeds are looked at before more are trained for what they do not decide."""
 
 
 def interval(differences: Sequence[float]) -> tuple[float, float]:
@@ -97,7 +101,8 @@ class RowStore:
 
     def of(self, scene: str, setting: Mapping[str, object]) -> dict[int, Row]:
         """Return the rows of a setting on a scene by seed."""
-        found = self.scenes[scene].of(resolved(setting, self.recipe, self.iterations))
+        kept = self.scenes.get(scene)
+        found = kept.of(resolved(setting, self.recipe, self.iterations)) if kept else {}
         return {seed: row for seed, row in found.items() if self.seeds is None or seed < self.seeds}
 
 
@@ -123,6 +128,17 @@ def judged(claim: Claim, store: RowStore) -> dict[str, tuple[int, Verdict]]:
             verdicts = [verdict(seeds, check.low, check.high) for check, seeds in of]
             found[scene] = min(len(seeds) for _, seeds in of), overall(verdicts, needs_all=True)
     return found
+
+
+def undecided(claim: Claim, scene: str, store: RowStore) -> list[Setting]:
+    """Return the settings of the checks of a claim that the rows of a scene do not decide, none if it fails there."""
+    open_ends = list[Setting]()
+    for check in claim.checks:
+        end = verdict(differences(check, scene, store), check.low, check.high)
+        if end == "fails":
+            return []
+        open_ends += [check.a, check.b] if end == "undecided" else []
+    return open_ends
 
 
 class Gain(NamedTuple):

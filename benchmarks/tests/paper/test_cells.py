@@ -4,7 +4,9 @@ import dataclasses
 import itertools
 import json
 import math
+import shutil
 import subprocess
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -275,6 +277,32 @@ def test_a_training_that_is_made_again_for_another_claim_is_measured_for_the_fir
         assert not run_cells(Grid(claims, scenes, "3dgs", 20, 1, tmp_path / "out", tmp_path / "rows"), Running(Here()))
     assert len(made) == 4
     assert made[3] == ("synthetic, 3dgs, dropout(0.2), seed 0", {"path", "renders"})
+
+
+def test_seeds_beyond_three_are_only_for_what_three_leave_undecided(tmp_path, monkeypatch):
+    """Claim 11 asks for differences below 0.2 dB: degree 0 has none, those of 1 and 2 lie at the limit."""
+    scenes = chosen_scenes([], tmp_path, SceneOptions("synthetic", downscale=8))
+    grid = Grid(chosen(["11"], [*scenes]), scenes, "3dgs", 20, 8, tmp_path / "out", tmp_path / "rows", sequential=True)
+    apart = {0: [0.0] * 8, 1: [0.1, 0.2, 0.3] * 3, 2: [0.1, 0.2, 0.3] * 3, None: [0.0] * 8}
+
+    def measured(cell, *_):
+        gain = apart[cell.setting.get("sh_degree")][cell.seed]
+        return {"setting": dict(cell.setting), "seed": cell.seed, "test": {"psnr": 20.0 + gain}}
+
+    monkeypatch.setattr(grid_module, "train_run", lambda *_: {"mean": {"test": {"psnr": 20.0}}, "seconds": 1.0})
+    monkeypatch.setattr(cells_module, "measured", measured)
+
+    def seeds():
+        return dict(Counter(row["setting"].get("sh_degree") for row in rows_of(grid)["synthetic"].rows))
+
+    assert len(declared(grid)) == 4 * 3 + 4 * 5  # of what is not trained nothing is decided
+    assert run_cells(grid, Running(Here())) == {}
+    assert seeds() == {0: 3, 1: 8, 2: 8, None: 8}
+    assert all(is_done(cell, rows_of(grid)) for cell in declared(grid))
+    shutil.rmtree(tmp_path / "rows")
+    apart[2] = [1.0] * 8  # one check fails, and with it the claim
+    assert run_cells(grid, Running(Here())) == {}
+    assert seeds() == {0: 3, 1: 3, 2: 3, None: 3}
 
 
 @pytest.mark.slow
