@@ -19,12 +19,14 @@ from benchmarks.setting import (
     BINOCULAR,
     DISTILLED,
     FEWEST,
+    HALF,
     HELD_OUT,
     LATER,
     ONE_EXPOSURE,
     OTHER_KINDS,
     REFERENCES,
     RELATIVE,
+    THIRD,
     TWICE,
     Row,
     from_dense,
@@ -63,6 +65,10 @@ _WARPS = ("warp", "warp + no smoothness", _HIDDEN, f"{_HIDDEN} + no smoothness")
 _RATES = ("means x4", "means x1/4", "means by pixels", "opacities x1/2", "scales x1/2", "colors x1/2")
 _NAMED = ("rate 0.1", "random background", "rate 0.35", "flat")
 _SHAPES = ("D-SSIM 0.4", "D-SSIM 0.4 + threshold 7e-4", "needles", "needles, weakly")
+_SHORTER = (
+    f"{DISTILLED[2]}, {HALF}", f"{DISTILLED[3]}, {THIRD}", f"distilled with {HALF}",
+    f"distilled with means x1/4 + {HALF}, {_HIDDEN} + {HALF}",
+)  # fmt: skip
 _COUNTS = ("5,000 dense and few", "8,000 dense and few", "30,000 dense and few", "filled")
 CHOICES = {
     "third": Choice(("rate 0.3", "no reset", "threshold 3e-4"), seeds=(0,)),
@@ -78,6 +84,7 @@ CHOICES = {
     "tenth": Choice((ONE_EXPOSURE,), seeds=range(6), tried=(0, 1, 2)),
     "eleventh": Choice((DISTILLED[2], DISTILLED[3], DISTILLED[1], TWICE), seeds=range(6), tried=(3,)),
     "twelfth": Choice((DISTILLED[2], *OTHER_KINDS), seeds=range(6), tried=(3,)),
+    "thirteenth": Choice((HALF, THIRD, DISTILLED[2], OTHER_KINDS[-1], *_SHORTER), seeds=range(6), tried=(3,)),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""

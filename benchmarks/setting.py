@@ -106,8 +106,9 @@ ONE_EXPOSURE = "one exposure"
 """What the tenth choice adds: photographs made equally bright, ``--one-exposure``."""
 DISTILLED = {1: "distilled, alone", 2: "distilled of two", 3: "distilled of three"}
 """What the eleventh choice adds, by the number of models."""
-TWICE = "twice the steps"
-"""What takes as long as the second of these."""
+TWICE, HALF, THIRD = "twice the steps", "half the steps", "a third of the steps"
+"""What takes as long as the second of these, and what the thirteenth choice distills."""
+_STEPS = {6_000: TWICE, 1_500: HALF, 1_000: THIRD}
 BINOCULAR, RELATIVE = "Binocular3DGS, dropout", ", relative shift"
 """A setting of others, and the end of its name where the shift of its warp goes by the distance of the cameras."""
 OTHER_KINDS = tuple(
@@ -220,7 +221,7 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
             for name, (x, value) in values.items()
             if (value in x if isinstance(x, str) else x in value if isinstance(value, tuple) else x == value)
         ]
-        return " + ".join([*changes, *[TWICE] * (config.iterations == 6_000)]) or CHOSEN
+        return " + ".join([*changes, *filter(None, [_STEPS.get(config.iterations)])]) or CHOSEN
     if "warp" in config.loss:
         return "Binocular3DGS" + ", dropout" * bool(config.dropout) + RELATIVE * ("relative" in config.loss)
     name = "dropout" if config.dropout else "noise" if config.noise else "plain"
@@ -232,7 +233,8 @@ def _distilled(loss: str) -> str:
     runs = [Path(ply).parent for ply in re.findall(r"'([^']*\.ply)'", loss)]
     first, *others = (candidate(read_run_settings(run / "config.json")[1]) for run in runs)
     kinds = [other.removeprefix(f"{LATER} + ") for other in others if other != first]
-    return f"distilled with {', '.join(kinds)}" if kinds else DISTILLED[len(runs)]
+    steps = [f", {part}" for part in first.split(" + ") if part in _STEPS.values()]
+    return f"distilled with {', '.join(kinds)}" if kinds else "".join([DISTILLED[len(runs)], *steps])
 
 
 def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
@@ -467,7 +469,7 @@ def from_dense(scene: str) -> str:
 
 def _is_second(candidate: str) -> bool:
     names = set(candidate.split(" + "))
-    return names <= _SECOND.keys() or "distilled" in candidate or bool(names & {ONE_EXPOSURE, TWICE})
+    return names <= _SECOND.keys() or "distilled" in candidate or bool(names & {ONE_EXPOSURE, *_STEPS.values()})
 
 
 def rows_of(rows: Sequence[Row], scene: str, name: str) -> dict[int, Row]:

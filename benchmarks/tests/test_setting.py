@@ -125,6 +125,10 @@ def test_a_distillation_is_named_by_the_number_of_its_models(tmp_path):
         assert config.loss == f"photometric + distillation({members})"
         assert setting.candidate(config, options) == f"from 1,000 + {name}"
     assert setting.candidate(with_recipe("sparse", iterations=6_000)) == "from 1,000 + twice the steps"
+    write_json(run / "config.json", run_settings(scene, with_recipe("sparse", iterations=1_500)))
+    assert setting.candidate(*reversed(distilled([run] * 2))) == "from 1,000 + distilled of two, half the steps"
+    write_json(run / "config.json", run_settings(scene, with_recipe("3dgs", iterations=3_000)))
+    assert setting.candidate(*reversed(distilled([run] * 2))) == "plain + distilled of two"
 
 
 def test_a_distillation_of_two_kinds_is_named_by_the_second(tmp_path):
