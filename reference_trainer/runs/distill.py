@@ -23,20 +23,23 @@ _THREE: tuple[dict[str, Any], ...] = (
 
 
 def member_settings(config: TrainConfig, number: int, of: int) -> TrainConfig:
-    """Return the settings of a member from those of the first, number 0; benchmarks/setting.md chose the kinds.
+    """Return the settings of a member from those of the first, number 0, of ``sparse``.
 
-    Members have seeds of their own, three of them other settings as well.
+    The first learns from the others, which have seeds of their own and half of its steps; three have other settings as
+    well. benchmarks/setting.md chose both.
 
     Example:
-        >>> first = with_recipe("sparse", iterations=1_500)
+        >>> first = with_recipe("sparse", iterations=3_000)
         >>> second, third = (member_settings(first, number, of=3) for number in (1, 2))
-        >>> second.seed, second.means_rate, third.loss
-        (1, 4e-05, 'photometric + warp(between(1.0, 1000), shift=0.15, relative=True, hidden=0.02)')
+        >>> second.seed, second.iterations, second.means_rate, third.loss
+        (1, 1500, 4e-05, 'photometric + warp(between(1.0, 1000), shift=0.15, relative=True, hidden=0.02)')
     """
-    changes = dict(_THREE[number]) if of == len(_THREE) else {}
+    if number == 0:
+        return config
+    changes, steps = dict(_THREE[number]) if of == len(_THREE) else {}, config.iterations // 2
     if loss := changes.get("loss"):
-        changes["loss"] = with_steps(loss, config.iterations / RECIPES["sparse"].config.iterations)
-    return replace(config, seed=config.seed + number, **changes)
+        changes["loss"] = with_steps(loss, steps / RECIPES["sparse"].config.iterations)
+    return with_recipe("sparse", iterations=steps, seed=config.seed + number, **changes)
 
 
 def distilled(members: Sequence[Path]) -> tuple[SceneOptions, TrainConfig]:

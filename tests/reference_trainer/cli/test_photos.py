@@ -173,6 +173,7 @@ def test_models_of_several_kinds_become_one(garden, tmp_path, capsys, monkeypatc
     out = tmp_path / "out"
     members = [load_run(out / "members" / str(seed)) for seed in range(3)]
     assert [member.config.seed for member in members] == [0, 1, 2]
+    assert [member.config.iterations for member in members] == [2, 1, 1]
     assert [member.config.means_rate for member in members] == [1.6e-4, 4e-5, 1.6e-4]
     assert ["warp" in member.config.loss for member in members] == [False, False, True]
     assert not members[0].gaussians.means.equal(members[1].gaussians.means)
