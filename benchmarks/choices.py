@@ -37,7 +37,7 @@ from reference_trainer.evaluation.tables import format_mean_std, markdown_table,
 
 __all__ = [
     "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_DEFAULT", "CHOICES", "ENSEMBLE", "KINDS", "PLAIN_ENSEMBLE",
-    "SHARPER", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "pairs_of", "tables",
+    "SHARPER", "SHORTER", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "pairs_of", "tables",
 ]  # fmt: skip
 
 
@@ -102,15 +102,18 @@ PLAIN_ENSEMBLE = {"plain": "plain", f"plain + {DISTILLED[2]}": f"plain, {DISTILL
 _SLOW, *_, _WITH_BINOCULAR, _THREE_KINDS = OTHER_KINDS
 KINDS = tuple({"plain": "plain", f"{LATER} + {name}": name} for name in (_SLOW, _THREE_KINDS, _WITH_BINOCULAR))
 """The judgement of the twelfth choice, of two models and of three, and what was not chosen."""
+SHORTER = tuple({"plain": "plain", f"{LATER} + {name}": name} for name in _SHORTER[2:])
+"""That of the thirteenth, of two models and of three."""
 BESIDE_TWO = {f"{LATER} + {name}": name for name in (DISTILLED[2], _THREE_KINDS)}
 """Three kinds beside two seeds."""
 BESIDE_BINOCULAR = tuple(
     {f"{BINOCULAR}{RELATIVE}": BINOCULAR, f"{LATER} + {name}": name}
-    for name in (DISTILLED[2], _THREE_KINDS, _WITH_BINOCULAR)
+    for name in (DISTILLED[2], _THREE_KINDS, _WITH_BINOCULAR, *_SHORTER[2:])
 )
 """All these beside Binocular3DGS, from the start that a user has."""
 _JUDGED = (
-    SLOWER_MEANS, SHARPER, ENSEMBLE, PLAIN_ENSEMBLE, *KINDS, BESIDE_TWO, *BESIDE_BINOCULAR, BY_DEFAULT, BESIDE_DROPOUT,
+    SLOWER_MEANS, SHARPER, ENSEMBLE, PLAIN_ENSEMBLE, *KINDS, *SHORTER, BESIDE_TWO, *BESIDE_BINOCULAR, BY_DEFAULT,
+    BESIDE_DROPOUT,
 )  # fmt: skip
 
 
