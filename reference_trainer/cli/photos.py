@@ -137,7 +137,7 @@ class Run:
         run.report_file([self.folder])
 
     def __call__(self) -> None:
-        from reference_trainer.runs.distill import distilled, member_settings
+        from reference_trainer.runs.distill import distilled
         from reference_trainer.runs.run import run_experiment
 
         self.rendering.choose(self.device)
@@ -149,8 +149,7 @@ class Run:
                 self._begin_again()
         print(self._forecast(scene, options, config), flush=True)
         self._poses(scene)
-        for number, folder in enumerate(self._trained):
-            own = member_settings(config, number, self.members)
+        for folder, own in self._members(config):
             run_experiment(options, own, folder, auto=True, device=self.device, progress=True)
         if self.members > 1:
             run_experiment(*distilled(self._trained), self.folder, device=self.device, progress=True)
@@ -290,6 +289,13 @@ class Run:
                 raise ValueError(f"{error} Or train again with --from train.") from error
         return options, config
 
+    def _members(self, config: TrainConfig) -> list[tuple[Path, TrainConfig]]:
+        """Return folder and settings of every training but that of their distillation."""
+        from reference_trainer.runs.distill import member_settings
+
+        settings = (member_settings(config, number, self.members) for number in range(self.members))
+        return [*zip(self._trained, settings, strict=True)]
+
     def _forecast(self, scene: Path, options: SceneOptions, config: TrainConfig) -> str:
         """Return how long what is still to be done will take, from a few training steps on this machine.
 
@@ -297,7 +303,6 @@ class Run:
         number; all else is counted in timed steps too, so that it scales with the machine. On a card, what the
         processor does is taken to last as on the machine of `_REFERENCE`.
         """
-        from reference_trainer.runs.distill import member_settings
         from reference_trainer.runs.warmup import step_seconds
         from reference_trainer.scenes.colmap import colmap_folders
         from reference_trainer.scenes.dense import matched_size
@@ -307,8 +312,8 @@ class Run:
         if (self.folder / run.RESULTS).exists():
             return "Trained and measured before."
         full, factor, new, steps, measured = self._sizes(scene), options.downscale or 1.0, 0, 0.0, 1
-        for number, folder in enumerate(self._trained):
-            own, begun = member_settings(config, number, self.members), (folder / run.CHECKPOINT).exists()
+        for folder, own in self._members(config):
+            begun = (folder / run.CHECKPOINT).exists()
             left = own.iterations - (load_checkpoint(folder / run.CHECKPOINT)["step"] if begun else 0)
             steps += left * (_WARPED if "warp(" in own.loss else 1)
             new += not begun
