@@ -109,6 +109,7 @@ DISTILLED = {1: "distilled, alone", 2: "distilled of two", 3: "distilled of thre
 TWICE, HALF, THIRD = "twice the steps", "half the steps", "a third of the steps"
 """What takes as long as the second of these, and what the thirteenth choice distills."""
 _STEPS = {6_000: TWICE, 1_500: HALF, 1_000: THIRD}
+"""The names by the number of steps."""
 BINOCULAR, RELATIVE = "Binocular3DGS, dropout", ", relative shift"
 """A setting of others, and the end of its name where the shift of its warp goes by the distance of the cameras."""
 OTHER_KINDS = tuple(
@@ -221,7 +222,7 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
             for name, (x, value) in values.items()
             if (value in x if isinstance(x, str) else x in value if isinstance(value, tuple) else x == value)
         ]
-        return " + ".join([*changes, *filter(None, [_STEPS.get(config.iterations)])]) or CHOSEN
+        return " + ".join([*changes, *(name for steps, name in _STEPS.items() if steps == config.iterations)]) or CHOSEN
     if "warp" in config.loss:
         return "Binocular3DGS" + ", dropout" * bool(config.dropout) + RELATIVE * ("relative" in config.loss)
     name = "dropout" if config.dropout else "noise" if config.noise else "plain"

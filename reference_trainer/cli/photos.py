@@ -83,7 +83,7 @@ class Run:
     """5,000 steps at half a megapixel."""
     members: int = 1
     """Models to train, the others half as long as the first, and to distill into one, which errs less where few
-    photographs look: 2, of other seeds, take twice as long to train as one; of 3, 2.7 times, the second has slower
+    photographs look: 2, of other seeds, take 1.8 times as long to train as one; of 3, 2.5 times, the second has slower
     means and the third Binocular3DGS's warp."""
     again: Annotated[Step | None, tyro.conf.arg(name="from")] = None
     """Do this step and those after it again: what they wrote is deleted."""
