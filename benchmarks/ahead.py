@@ -35,7 +35,7 @@ TARGETS |= {f"gfx{x}": GPUTarget("hip", f"gfx{x}", 64 if x[0] == "9" else 32) fo
 _TYPES = {name: "*i32" for name in ("starts", "gaussians", "counts", "visible", "places")}
 _TYPES |= {"indices": "*i64", "order": "*i64", "ends": "*i64", "keys": "*i16", "numbers": "*fp64"}
 _TYPES |= {"touched": "*u8"}
-_TYPES |= {name: "i32" for name in ("first", "count", "width", "height", "columns", "listing")}
+_TYPES |= {name: "i32" for name in ("first", "count", "width", "height", "columns", "listing", "tiles")}
 _TYPES |= {name: "i32" for name in ("stride", "absolute_stride", *(f"count{i}" for i in range(6)))}
 _TYPES |= {f"row_{name}": "i32" for name in ("centers", "factors", "depths", "colors", "opacities")}
 _TYPES |= {name: "fp32" for name in ("fx", "fy", "cx", "cy", "limit_x", "limit_y", "half_width", "half_height")}
@@ -114,6 +114,7 @@ KERNELS = [
     *(Kernel(f"fill table, {x} more", tiles.fill_table, {"MORE": x, "BLOCK": 256}, 4, walks=False) for x in (0, 1, 2)),
     Kernel("list tiles", binning.list_tiles, _LISTING, walks=False),
     Kernel("list tiles, 2^15 and more", binning.list_tiles, _LISTING, walks=False, types={"keys": "*i32"}),
+    Kernel("gather lists", binning.gather_lists, {"BLOCK": 1024}, 4, walks=False, types={"found": "*i32"}),
     *(
         Kernel("densification", _statistics_triton.add_gradients, {"ABSOLUTE": x, "BLOCK": 256}, 4, walks=False)
         for x in (False, True)

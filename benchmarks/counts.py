@@ -201,12 +201,12 @@ def _outside_of_kernels(mode: _Operations) -> Any:
 
 def counted(work: Callable[[], Any]) -> tuple[int, _Operations, Any]:
     """Return the launches of a call, what was counted, and what it returned."""
-    from reference_trainer.render.triton import tiles
+    from reference_trainer.render.triton.launching import LAUNCHED
 
-    mode, before = _Operations(), sum(tiles.LAUNCHED.values())
+    mode, before = _Operations(), sum(LAUNCHED.values())
     with _outside_of_kernels(mode), _ReadBacks(mode), mode:
         out = work()
-    return mode.launches + sum(tiles.LAUNCHED.values()) - before, mode, out
+    return mode.launches + sum(LAUNCHED.values()) - before, mode, out
 
 
 @torch.no_grad()
@@ -241,7 +241,7 @@ class StepCounts(NamedTuple):
 
 def count_step(device: torch.device | str = "cpu", **settings: Any) -> StepCounts:
     """Count a training step of the built-in scene in little, with the engine triton, by PyTorch's dispatcher."""
-    from reference_trainer.render.triton import tiles
+    from reference_trainer.render.triton.launching import LAUNCHED
 
     use_engine("triton")
     scene = synthetic_scene(width=32, height=24, points=40)
@@ -250,9 +250,9 @@ def count_step(device: torch.device | str = "cpu", **settings: Any) -> StepCount
     photograph = scene.train[0].image.to(device)
     image = (photograph / 2).requires_grad_()
     loss, _, _ = counted(lambda: photometric_loss(image, photograph).backward())
-    begun = tiles.LAUNCHED["adam"]
+    begun = LAUNCHED["adam"]
     everything, mode, _ = counted(trainer.train_step)
-    optimizer = tiles.LAUNCHED["adam"] - begun
+    optimizer = LAUNCHED["adam"] - begun
     return StepCounts(everything - optimizer, loss, optimizer, mode.read_backs)
 
 

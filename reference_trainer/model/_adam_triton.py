@@ -8,7 +8,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from reference_trainer.render.triton.tiles import launch
+from reference_trainer.render.triton.launching import kernel, launch
 
 __all__ = ["adam_step"]
 
@@ -30,10 +30,7 @@ def _update(x, gradient, first, second, i, real, rate, gain1, gain2, correction,
     tl.store(x + i, old - rate * m / (tl.sqrt(v) * correction + epsilon), mask=real)
 
 
-@triton.jit(do_not_specialize=[
-    "count0", "count1", "count2", "count3", "count4", "count5", "rate0", "rate1", "rate2", "rate3", "rate4", "rate5",
-    "gain1", "gain2", "correction", "epsilon",
-])  # fmt: skip
+@kernel
 def adam(
     x0, g0, m0, v0, x1, g1, m1, v1, x2, g2, m2, v2, x3, g3, m3, v3, x4, g4, m4, v4, x5, g5, m5, v5,
     count0, count1, count2, count3, count4, count5, rate0, rate1, rate2, rate3, rate4, rate5,

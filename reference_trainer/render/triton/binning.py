@@ -11,12 +11,14 @@ from torch import Tensor
 
 from reference_trainer.render.constants import MIN_ALPHA, TILE
 from reference_trainer.render.splats import Projected, TileCounts, TileLists
-from reference_trainer.render.triton.tiles import ENTRIES, SEEN, launch
+from reference_trainer.render.triton.launching import kernel, launch
+from reference_trainer.render.triton.tiles import ENTRIES, SEEN
 
 __all__ = ["bin_gaussians", "count_tiles"]
 
 _MIN_ALPHA = tl.constexpr(MIN_ALPHA)
-_GROUP = 32  # Gaussians of a program, one per lane of a warp,
+_BLOCK = 1024  # entries of a program that gathers
+_GROUP = 32  # Gaussians of a program that lists, one per lane of a warp,
 _LANES = 8  # and columns of tiles that it lists at once: one that covers 10,000 tiles takes 1,250 steps
 
 
@@ -27,7 +29,7 @@ def _boundary(dy, side, limit, x, l11, l21, l22):
     return x + (side * half - l21 * dy) / l11
 
 
-@triton.jit(do_not_specialize=["width", "height", "columns", "listing"])
+@kernel
 def list_tiles(
     order, means, factors, covariances, opacities, counts, ends, touched,
     keys, gaussians, numbers, width, height, columns, listing, TILE: tl.constexpr,
@@ -90,6 +92,21 @@ def list_tiles(
         tl.atomic_add(numbers + ENTRIES, tl.sum(found).to(tl.float64), sem="relaxed")
 
 
+@kernel
+def gather_lists(keys, order, gaussians, found, starts, count, tiles, BLOCK: tl.constexpr):
+    """Put the Gaussians in the order of the sorted keys, and tell where each tile's begin and the last ends."""
+    e = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    i = tl.load(order + e, mask=e < count, other=0)
+    tl.store(found + e, tl.load(gaussians + i, mask=e < count, other=0), mask=e < count)
+    # Every tile looks for the first key that is not below its own number, among the ``left`` from ``first`` on.
+    first, left = 0 * e, tl.where(e <= tiles, count, 0)
+    while tl.max(left) > 0:
+        half = left // 2
+        below = (left > 0) & (tl.load(keys + first + half, mask=left > 0, other=0).to(tl.int32) < e)
+        first, left = tl.where(below, first + half + 1, first), tl.where(below, left - half - 1, half)
+    tl.store(starts + e, first, mask=e <= tiles)
+
+
 def _launch(
     listing: bool, order: Tensor, shapes: Sequence[Tensor], counts: TileCounts, ends: Tensor, entries: Sequence[Tensor],
     width: int, height: int,
@@ -137,6 +154,10 @@ def bin_gaussians(projected: Projected, width: int, height: int) -> TileLists:
     if counts.total:
         _launch(True, order, shapes, counts, ends, (keys, gaussians), width, height)
     keys, by_tile = torch.sort(keys, stable=True)
-    edges = torch.arange(_tiles(width, height) + 1, dtype=keys.dtype, device=keys.device)
-    starts = torch.searchsorted(keys, edges, out_int32=True)
-    return TileLists(width, height, starts, gaussians[by_tile], counts.touched)
+    tiles, found = _tiles(width, height), torch.empty_like(gaussians)
+    starts = found.new_empty(tiles + 1)
+    grid = (triton.cdiv(max(counts.total, tiles + 1), _BLOCK),)
+    launch(
+        gather_lists, grid, keys, by_tile, gaussians, found, starts, counts.total, tiles, warps=4, BLOCK=_BLOCK
+    )  # fmt: skip
+    return TileLists(width, height, starts, found, counts.touched)

@@ -17,7 +17,8 @@ from torch.autograd.function import once_differentiable
 from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 from reference_trainer.render.splats import Splats
 from reference_trainer.render.triton import tiles
-from reference_trainer.render.triton.tiles import FAINT, Lists, add_row, alpha_at, geometry_sums, make_row, pixels
+from reference_trainer.render.triton.launching import kernel, launch
+from reference_trainer.render.triton.tiles import Lists, add_row, alpha_at, geometry_sums, make_row, pixels
 
 __all__ = ["absolute_gradients", "composite", "composite_masks"]
 
@@ -42,7 +43,7 @@ def _store_over(image, place, size, inside, r, g, b, t, background):
     tiles.store3(image, place, size, inside, r, g, b + t * tl.load(background + 2))
 
 
-@triton.jit(do_not_specialize=["width", "height", "columns"])
+@kernel
 def composite_forward(
     table, starts, gaussians, background, image, alpha, width, height,
     columns, STRIDE: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr,
@@ -56,15 +57,13 @@ def composite_forward(
     while (begin < end) & (tl.max(t) > 0):
         for e in range(begin, tl.minimum(begin + _CHUNK, end)):
             row = table + tl.load(gaussians + e) * STRIDE
-            log_opacity = tl.load(row + 5)
-            if log_opacity >= FAINT:  # else left out by a mask
-                raw, _geometry = alpha_at(row, log_opacity, x, y)
-                weight, t = _pass(tl.minimum(raw, _MAX_ALPHA), t)
-                r += weight * tl.load(row + 6)
-                g += weight * tl.load(row + 7)
-                b += weight * tl.load(row + 8)
-                if DEPTH:
-                    d += weight * tl.load(row + 9)
+            raw, _geometry = alpha_at(row, x, y)
+            weight, t = _pass(tl.minimum(raw, _MAX_ALPHA), t)
+            r += weight * tl.load(row + 6)
+            g += weight * tl.load(row + 7)
+            b += weight * tl.load(row + 8)
+            if DEPTH:
+                d += weight * tl.load(row + 9)
         begin += _CHUNK
     t, size = tl.abs(t), (width * height).to(tl.int64)
     tl.store(alpha + place, 1 - t, mask=inside)
@@ -73,7 +72,7 @@ def composite_forward(
         tl.store(image + 3 * size + place, d, mask=inside)
 
 
-@triton.jit(do_not_specialize=["width", "height", "columns"])
+@kernel
 def composite_backward(
     table, starts, gaussians, image, alpha, to_image, to_alpha, rows,
     width, height, columns, STRIDE: tl.constexpr, TILE: tl.constexpr, DEPTH: tl.constexpr,
@@ -105,37 +104,35 @@ def composite_backward(
         for e in range(begin, tl.minimum(begin + _CHUNK, end)):
             i = tl.load(gaussians + e)
             row = table + i * STRIDE
-            log_opacity = tl.load(row + 5)
-            if log_opacity >= FAINT:
-                raw, geometry = alpha_at(row, log_opacity, x, y)
-                clamped, front = tl.minimum(raw, _MAX_ALPHA), t
-                weight, t = _pass(clamped, front)
-                along = u_a + u_r * tl.load(row + 6) + u_g * tl.load(row + 7) + u_b * tl.load(row + 8)
+            raw, geometry = alpha_at(row, x, y)
+            clamped, front = tl.minimum(raw, _MAX_ALPHA), t
+            weight, t = _pass(clamped, front)
+            along = u_a + u_r * tl.load(row + 6) + u_g * tl.load(row + 7) + u_b * tl.load(row + 8)
+            if DEPTH:
+                along += u_d * tl.load(row + 9)
+            beyond -= weight * along
+            # raw times the gradient of alpha is that of ln alpha, from which `geometry_sums` goes on. raw stands
+            # for the clamped alpha too, which passes gradients, and 1 - clamped is at least 1 - MAX_ALPHA: no
+            # division by 0. The splat at which a pixel terminates has no weight there, and so no gradient.
+            slope = tl.where(t > 0, raw * (front * along - beyond / (1 - clamped)), 0.0)  # of ln alpha
+            if ABSOLUTE:
+                _dx, _dy, w1, w2, l11, l21, l22, _opacity = geometry
+                to_x, to_y = tl.abs(slope * (l11 * w1)), tl.abs(slope * (l21 * w1 + l22 * w2))
+                nothing = 0.0, 0.0, 0.0, 0.0
+                gradients = make_row((tl.sum(to_x), tl.sum(to_y), 0.0, 0.0), nothing, nothing)
+                add_row(rows, gradients, e, i, 2, EACH)
+            else:
+                g0, g1, g2, g3, g4, g5 = geometry_sums(slope, geometry)
+                to_r, to_g, to_b = tl.sum(weight * u_r), tl.sum(weight * u_g), tl.sum(weight * u_b)
+                to_d = 0.0
                 if DEPTH:
-                    along += u_d * tl.load(row + 9)
-                beyond -= weight * along
-                # raw times the gradient of alpha is that of ln alpha, from which `geometry_sums` goes on. raw stands
-                # for the clamped alpha too, which passes gradients, and 1 - clamped is at least 1 - MAX_ALPHA: no
-                # division by 0. The splat at which a pixel terminates has no weight there, and so no gradient.
-                slope = tl.where(t > 0, raw * (front * along - beyond / (1 - clamped)), 0.0)  # of ln alpha
-                if ABSOLUTE:
-                    _dx, _dy, w1, w2, l11, l21, l22 = geometry
-                    to_x, to_y = tl.abs(slope * (l11 * w1)), tl.abs(slope * (l21 * w1 + l22 * w2))
-                    nothing = 0.0, 0.0, 0.0, 0.0
-                    gradients = make_row((tl.sum(to_x), tl.sum(to_y), 0.0, 0.0), nothing, nothing)
-                    add_row(rows, gradients, e, i, 2, EACH)
-                else:
-                    g0, g1, g2, g3, g4, g5 = geometry_sums(slope, geometry, log_opacity)
-                    to_r, to_g, to_b = tl.sum(weight * u_r), tl.sum(weight * u_g), tl.sum(weight * u_b)
-                    to_d = 0.0
-                    if DEPTH:
-                        to_d = tl.sum(weight * u_d)
-                    gradients = make_row((g0, g1, g2, g3), (g4, g5, to_r, to_g), (to_b, to_d, 0.0, 0.0))
-                    add_row(rows, gradients, e, i, STRIDE, EACH)
+                    to_d = tl.sum(weight * u_d)
+                gradients = make_row((g0, g1, g2, g3), (g4, g5, to_r, to_g), (to_b, to_d, 0.0, 0.0))
+                add_row(rows, gradients, e, i, STRIDE, EACH)
         begin += _CHUNK
 
 
-@triton.jit(do_not_specialize=["width", "height", "columns", "first", "count"])
+@kernel
 def composite_masked(
     table, starts, gaussians, background, ratios, images, alphas, first, count,
     width, height, columns, STRIDE: tl.constexpr, TILE: tl.constexpr, MASKS: tl.constexpr,
@@ -157,15 +154,13 @@ def composite_masked(
         for e in range(begin, tl.minimum(begin + _CHUNK, end)):
             i = tl.load(gaussians + e)
             row = table + i * STRIDE
-            log_opacity = tl.load(row + 5)
-            if log_opacity >= FAINT:
-                raw, _geometry = alpha_at(row, log_opacity, x, y)
-                ratio = tl.load(ratios + i.to(tl.int64) * count + which, mask=which < count, other=0.0)
-                lower = ratio[:, None] * raw[None, :]
-                weight, t = _pass(tl.where(lower >= _MIN_ALPHA, tl.minimum(lower, _MAX_ALPHA), 0.0), t)
-                r += weight * tl.load(row + 6)
-                g += weight * tl.load(row + 7)
-                b += weight * tl.load(row + 8)
+            raw, _geometry = alpha_at(row, x, y)
+            ratio = tl.load(ratios + i.to(tl.int64) * count + which, mask=which < count, other=0.0)
+            lower = ratio[:, None] * raw[None, :]
+            weight, t = _pass(tl.where(lower >= _MIN_ALPHA, tl.minimum(lower, _MAX_ALPHA), 0.0), t)
+            r += weight * tl.load(row + 6)
+            g += weight * tl.load(row + 7)
+            b += weight * tl.load(row + 8)
         begin += _CHUNK
     t, size = tl.abs(t), (width * height).to(tl.int64)
     at = which.to(tl.int64)[:, None] * size + place[None, :]
@@ -232,7 +227,7 @@ def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tu
         (0, groups, _MASKS),
         (groups * _MASKS, min(1, count % _MASKS), triton.next_power_of_2(count % _MASKS)),
     ):
-        tiles.launch(
+        launch(
             composite_masked, (lists.tiles, programs), table, lists.starts, lists.gaussians, background, ratios,
             images, alphas, first, count, *size, STRIDE=table.shape[1], TILE=lists.tile, MASKS=masks,
         )  # fmt: skip

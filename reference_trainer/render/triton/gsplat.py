@@ -100,7 +100,7 @@ class GsplatMoments:
             values = values.reshape(len(opacity), -1).to(a)
             return values if which is None else values[which]
 
-        log_opacity = meta["opacities"].reshape(-1, 1).float().log2()
+        log_opacity = meta["opacities"].reshape(-1, 1).float().clamp_min(1e-30).log2()
         columns = (meta["means2d"].reshape(-1, 2), torch.stack([l11, l21, l22], 1), log_opacity, rows(colors))
         table = torch.cat([*columns, rows(multiplier.mean), rows(multiplier.variance)], dim=1).float()
         ids, size = meta["flatten_ids"].int(), (3, int(meta["height"]), int(meta["width"]))

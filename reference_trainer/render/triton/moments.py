@@ -21,7 +21,8 @@ from torch.autograd.function import once_differentiable
 from reference_trainer.render.constants import TILE
 from reference_trainer.render.splats import MomentImages, Splats
 from reference_trainer.render.triton import tiles
-from reference_trainer.render.triton.tiles import FAINT, Lists, add_row, alpha_at, geometry_sums, make_row, pixels
+from reference_trainer.render.triton.launching import kernel
+from reference_trainer.render.triton.tiles import Lists, add_row, alpha_at, geometry_sums, make_row, pixels
 
 __all__ = ["moments", "moments_of", "shares", "shares_of"]
 
@@ -39,7 +40,7 @@ def _random(row, raw, MAX: tl.constexpr):
     return alpha, expected, spread, passed, passed * passed + spread
 
 
-@triton.jit(do_not_specialize=["width", "height", "columns"])
+@kernel
 def moments_forward(
     table, starts, gaussians, background, mean, variance, alpha, width, height,
     columns, STRIDE: tl.constexpr, TILE: tl.constexpr, MAX: tl.constexpr,
@@ -53,14 +54,12 @@ def moments_forward(
     begin, e = tl.load(starts + tile), tl.load(starts + tile + 1) - 1
     while e >= begin:
         row = table + tl.load(gaussians + e) * STRIDE
-        log_opacity = tl.load(row + 5)
-        if log_opacity >= FAINT:
-            raw, _geometry = alpha_at(row, log_opacity, x, y)
-            _alpha, expected, spread, passed, shrink = _random(row, raw, MAX)
-            d0, d1, d2 = tl.load(row + 6) - m0, tl.load(row + 7) - m1, tl.load(row + 8) - m2
-            v0, v1, v2 = v0 * shrink + spread * d0 * d0, v1 * shrink + spread * d1 * d1, v2 * shrink + spread * d2 * d2
-            m0, m1, m2 = m0 + expected * d0, m1 + expected * d1, m2 + expected * d2
-            t *= passed
+        raw, _geometry = alpha_at(row, x, y)
+        _alpha, expected, spread, passed, shrink = _random(row, raw, MAX)
+        d0, d1, d2 = tl.load(row + 6) - m0, tl.load(row + 7) - m1, tl.load(row + 8) - m2
+        v0, v1, v2 = v0 * shrink + spread * d0 * d0, v1 * shrink + spread * d1 * d1, v2 * shrink + spread * d2 * d2
+        m0, m1, m2 = m0 + expected * d0, m1 + expected * d1, m2 + expected * d2
+        t *= passed
         e -= 1
     tl.store(alpha + place, 1 - t, mask=inside)
     tiles.store3(mean, place, size, inside, m0, m1, m2)
@@ -78,15 +77,13 @@ def _behind_chunk(
     e = last - 1
     while e >= first:
         row = table + tl.load(gaussians + e) * STRIDE
-        log_opacity = tl.load(row + 5)
-        if log_opacity >= FAINT:
-            raw, _geometry = alpha_at(row, log_opacity, x, y)
-            _alpha, expected, spread, passed, shrink = _random(row, raw, MAX)
-            d0, d1, d2 = tl.load(row + 6) - m0, tl.load(row + 7) - m1, tl.load(row + 8) - m2
-            if KEEP:
-                _store_state(kept + (e - first) * (_STATE * raw.shape[0]), (d0, d1, d2, hidden, t))
-            hidden = hidden * shrink + (u0 * d0 * d0 + u1 * d1 * d1 + u2 * d2 * d2) * spread
-            m0, m1, m2, t = m0 + expected * d0, m1 + expected * d1, m2 + expected * d2, t * passed
+        raw, _geometry = alpha_at(row, x, y)
+        _alpha, expected, spread, passed, shrink = _random(row, raw, MAX)
+        d0, d1, d2 = tl.load(row + 6) - m0, tl.load(row + 7) - m1, tl.load(row + 8) - m2
+        if KEEP:
+            _store_state(kept + (e - first) * (_STATE * raw.shape[0]), (d0, d1, d2, hidden, t))
+        hidden = hidden * shrink + (u0 * d0 * d0 + u1 * d1 * d1 + u2 * d2 * d2) * spread
+        m0, m1, m2, t = m0 + expected * d0, m1 + expected * d1, m2 + expected * d2, t * passed
         e -= 1
     return m0, m1, m2, hidden, t
 
@@ -105,7 +102,7 @@ def _load_state(at, PIXELS: tl.constexpr):
     return a, b, c, tl.load(at + 3 * PIXELS), tl.load(at + 4 * PIXELS)
 
 
-@triton.jit(do_not_specialize=["width", "height", "columns", "count"])
+@kernel
 def moments_backward(
     table, starts, gaussians, images, checkpoints, rows, count, width, height, columns,
     STRIDE: tl.constexpr, TILE: tl.constexpr, MAX: tl.constexpr, EACH: tl.constexpr,
@@ -163,27 +160,25 @@ def moments_backward(
             for e in range(first, last):
                 i = tl.load(gaussians + e)
                 row = table + i * STRIDE
-                log_opacity = tl.load(row + 5)
-                if log_opacity >= FAINT:
-                    d0, d1, d2, hidden, t = _load_state(kept + (e - first) * (_STATE * PIXELS), PIXELS)
-                    raw, geometry = alpha_at(row, log_opacity, x, y)
-                    alpha, expected, spread, passed, shrink = _random(row, raw, MAX)
-                    w0, w1, w2 = U0 * d0, U1 * d1, U2 * d2
-                    to_shrink, of_spread = front * hidden, front * (w0 * d0 + w1 * d1 + w2 * d2)
-                    to_spread = of_spread + to_shrink
-                    to_expected = u0 * d0 + u1 * d1 + u2 * d2 + u_a * t - 2 * passed * to_shrink
-                    twice = 2 * front * spread
-                    c0, c1, c2 = u0 * expected + twice * w0, u1 * expected + twice * w1, u2 * expected + twice * w2
-                    u0, u1, u2, u_a = u0 - c0, u1 - c1, u2 - c2, u_a * passed
-                    front *= shrink
-                    # expected = m alpha and spread = v alpha^2: to_alpha = m to_expected + 2 v alpha to_spread, and raw
-                    # times it is the gradient of ln alpha, as the clamp passes gradients. m and v take the rest.
-                    slope = raw * (2 * tl.load(row + 10) * to_spread * alpha + to_expected * tl.load(row + 9))
-                    g0, g1, g2, g3, g4, g5 = geometry_sums(slope, geometry, log_opacity)
-                    to_r, to_g, to_b, share = tl.sum(c0), tl.sum(c1), tl.sum(c2), tl.sum(of_spread * spread)
-                    to_m, to_v = tl.sum(to_expected * alpha), tl.sum(to_spread * alpha * alpha)
-                    gradients = make_row((g0, g1, g2, g3), (g4, g5, to_r, to_g), (to_b, to_m, to_v, share))
-                    add_row(rows, gradients, e, i, 12, EACH)
+                d0, d1, d2, hidden, t = _load_state(kept + (e - first) * (_STATE * PIXELS), PIXELS)
+                raw, geometry = alpha_at(row, x, y)
+                alpha, expected, spread, passed, shrink = _random(row, raw, MAX)
+                w0, w1, w2 = U0 * d0, U1 * d1, U2 * d2
+                to_shrink, of_spread = front * hidden, front * (w0 * d0 + w1 * d1 + w2 * d2)
+                to_spread = of_spread + to_shrink
+                to_expected = u0 * d0 + u1 * d1 + u2 * d2 + u_a * t - 2 * passed * to_shrink
+                twice = 2 * front * spread
+                c0, c1, c2 = u0 * expected + twice * w0, u1 * expected + twice * w1, u2 * expected + twice * w2
+                u0, u1, u2, u_a = u0 - c0, u1 - c1, u2 - c2, u_a * passed
+                front *= shrink
+                # expected = m alpha and spread = v alpha^2: to_alpha = m to_expected + 2 v alpha to_spread, and raw
+                # times it is the gradient of ln alpha, as the clamp passes gradients. m and v take the rest.
+                slope = raw * (2 * tl.load(row + 10) * to_spread * alpha + to_expected * tl.load(row + 9))
+                g0, g1, g2, g3, g4, g5 = geometry_sums(slope, geometry)
+                to_r, to_g, to_b, share = tl.sum(c0), tl.sum(c1), tl.sum(c2), tl.sum(of_spread * spread)
+                to_m, to_v = tl.sum(to_expected * alpha), tl.sum(to_spread * alpha * alpha)
+                gradients = make_row((g0, g1, g2, g3), (g4, g5, to_r, to_g), (to_b, to_m, to_v, share))
+                add_row(rows, gradients, e, i, 12, EACH)
         tiles.store3(images, place, size, inside, u0, u1, u2)
 
 

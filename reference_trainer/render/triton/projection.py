@@ -15,7 +15,8 @@ from reference_trainer.camera import Camera
 from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.splats import Projected, Projection
 from reference_trainer.render.triton.binning import count_tiles
-from reference_trainer.render.triton.tiles import ENTRIES, SEEN, launch
+from reference_trainer.render.triton.launching import kernel, launch
+from reference_trainer.render.triton.tiles import ENTRIES, SEEN
 
 __all__ = ["project"]
 
@@ -178,7 +179,7 @@ def _add_unless_finite(numbers, x):
         tl.atomic_add(numbers + 1, bad.to(tl.float64), sem="relaxed")
 
 
-@triton.jit(do_not_specialize=["count"])
+@kernel
 def find_visible(means, opacities, view, background, visible, numbers, count, BLOCK: tl.constexpr):
     """Tell who is in view; the first numbers, zeros before, are those of `check_projection`."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -195,7 +196,7 @@ def find_visible(means, opacities, view, background, visible, numbers, count, BL
         _add_unless_finite(numbers, tl.load(background + j, mask=j < 3, other=0.0))
 
 
-@triton.jit(do_not_specialize=["count"])
+@kernel
 def index_visible(places, indices, numbers, count, BLOCK: tl.constexpr):
     """List who is in view, in order, from the running number of these, and tell how many they are."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -206,7 +207,7 @@ def index_visible(places, indices, numbers, count, BLOCK: tl.constexpr):
     tl.store(numbers + (0 * i + SEEN), place.to(tl.float64), mask=i == count - 1)
 
 
-@triton.jit
+@kernel
 def project_forward(
     indices, means, quaternions, scales, sh, opacities, view, centers,
     factors, covariances, depths, colors, shown_opacities, numbers, fx, fy, cx, cy,
@@ -247,7 +248,7 @@ def project_forward(
     tl.atomic_add(numbers, tl.sum(tl.where(real, slopes[2], 0.0)).to(tl.float64), sem="relaxed")
 
 
-@triton.jit(do_not_specialize=["count", *(f"row_{x}" for x in ("centers", "factors", "depths", "colors", "opacities"))])
+@kernel
 def project_backward(
     indices, means, quaternions, scales, sh, view, colors,
     to_centers, to_factors, to_depths, to_colors, to_shown_opacities, to_means, to_quaternions,
@@ -370,13 +371,12 @@ class _Project(torch.autograd.Function):
         ]
         # A kernel takes an address in every place: without depths another, which it does not read.
         upstream.insert(2, _rows(gradients[3]) if depths else upstream[-1])
-        # One fill for all of them, and none if everything is written. Aligned alike whatever their sizes: kernels are
-        # compiled for the alignment of what they are given.
+        # One fill for all of them, and none if everything is written.
         shapes = [x.shape for x in given] + [given[0].shape[:1]]
         whole = len(indices) == len(given[0]) and max(1, ctx.constants["BANDS"]) == ctx.constants["ROW"]
-        sizes = [-(-shape.numel() // 32) * 32 for shape in shapes]
+        sizes = [shape.numel() for shape in shapes]
         parts = (colors.new_empty if whole else colors.new_zeros)(sum(sizes)).split(sizes)
-        found = [x[: shape.numel()].view(shape) for x, shape in zip(parts, shapes, strict=True)]
+        found = [x.view(shape) for x, shape in zip(parts, shapes, strict=True)]
         launch(
             project_backward, (triton.cdiv(len(indices), _BLOCK),), *saved, *upstream, *found, len(indices), *ctx.size,
             *(x.stride(0) for x in upstream), DEPTHS=depths, **ctx.constants,

@@ -8,7 +8,6 @@ latency of the loads: all lanes read the same row of the table, one transaction 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from typing import Any, NamedTuple
 
 import torch
@@ -18,11 +17,11 @@ from torch import Tensor
 
 from reference_trainer.render.constants import MAX_ALPHA, MIN_ALPHA, TILE
 from reference_trainer.render.splats import Splats, TileLists
+from reference_trainer.render.triton.launching import kernel, launch
 
 __all__ = [
-    "ENTRIES", "FAINT", "LAUNCHED", "ROW", "SEEN", "Lists", "add_row", "alpha_at", "fill_table", "geometry_sums",
-    "gradient_rows", "launch", "load3", "make_row", "make_table", "nvidia_options", "over_tiles", "pixels", "store3",
-    "sum_rows",
+    "ENTRIES", "ROW", "SEEN", "Lists", "add_row", "alpha_at", "fill_table", "geometry_sums", "gradient_rows", "load3",
+    "make_row", "make_table", "nvidia_options", "over_tiles", "pixels", "store3", "sum_rows",
 ]  # fmt: skip
 
 ROW = tl.constexpr(16)
@@ -32,13 +31,8 @@ SEEN, ENTRIES = tl.constexpr(18), tl.constexpr(19)
 """Where the numbers of a projection, of which the first 18 are checked, hold how many Gaussians are in view and the sum
 of their tiles: all that the processor waits for."""
 
-FAINT = tl.constexpr(math.log2(MIN_ALPHA))
-"""Binary logarithm of the alpha below which a splat is skipped."""
-
+_FAINT = tl.constexpr(math.log2(MIN_ALPHA))
 _HALF = tl.constexpr(0.5 * math.log2(math.e))  # exp(-x / 2) = 2^(-_HALF x)
-
-LAUNCHED: Counter[str] = Counter()
-"""How often each kernel has been launched in this process."""
 
 
 class Lists(NamedTuple):
@@ -71,14 +65,6 @@ class Lists(NamedTuple):
         return -(-self.width // self.tile) * -(-self.height // self.tile)
 
 
-def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 1, **constants: Any) -> None:
-    """Start the programs of a grid on the device of the first argument; an empty grid is no launch."""
-    if min(grid) > 0:
-        LAUNCHED[kernel.fn.__name__] += 1
-        with torch.cuda.device_of(arguments[0]):  # type: ignore[no-untyped-call]
-            kernel[grid](*arguments, num_warps=warps, enable_fp_fusion=True, **constants)
-
-
 def nvidia_options(warps: int) -> dict[str, int]:
     """Return what the kernels of a tile are compiled with on NVIDIA's cards.
 
@@ -89,7 +75,7 @@ def nvidia_options(warps: int) -> dict[str, int]:
 
 
 def over_tiles(
-    kernel: Any, lists: Lists, table: Tensor, *arguments: Any, programs: int = 0, per_warp: int = 64, **constants: Any
+    function: Any, lists: Lists, table: Tensor, *arguments: Any, programs: int = 0, per_warp: int = 64, **constants: Any
 ) -> None:
     """Start a program for every tile, or as many as told; a warp has 64 pixels, or as many as told."""
     warps = max(1, lists.tile**2 // per_warp)
@@ -97,12 +83,12 @@ def over_tiles(
         constants |= nvidia_options(warps)
     size = lists.width, lists.height, -(-lists.width // lists.tile)
     launch(
-        kernel, (programs or lists.tiles,), table, lists.starts, lists.gaussians, *arguments, *size,
+        function, (programs or lists.tiles,), table, lists.starts, lists.gaussians, *arguments, *size,
         warps=warps, STRIDE=table.shape[1], TILE=lists.tile, **constants,
     )  # fmt: skip
 
 
-@triton.jit(do_not_specialize=["count"])
+@kernel
 def fill_table(
     means, factors, opacities, colors, more, table, count, MORE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -115,7 +101,7 @@ def fill_table(
     for j in tl.static_range(3):
         tl.store(row + 2 + j, tl.load(factors + 3 * i + j, mask=real), mask=real)
         tl.store(row + 6 + j, tl.load(colors + 3 * i + j, mask=real), mask=real)
-    # Far below `FAINT`, but not 0, which has no logarithm.
+    # Far below `MIN_ALPHA`, but not 0, which has no logarithm.
     opacity = tl.maximum(tl.load(opacities + i, mask=real, other=1.0), 1e-30)
     tl.store(row + 5, tl.log2(opacity), mask=real)
     for j in tl.static_range(MORE):
@@ -179,27 +165,28 @@ def store3(image, place, size, inside, r, g, b):
 
 
 @triton.jit
-def alpha_at(row, log_opacity, x, y):
+def alpha_at(row, x, y):
     """Return a splat's alpha at the pixels before the clamp, 0 below `MIN_ALPHA`, and its geometry there.
 
     ln alpha = ln o - (w1^2 + w2^2) / 2 with w1 = l11 dx + l21 dy, w2 = l22 dy: squares of what is small wherever alpha
-    is not, so nothing cancels.
+    is not, so nothing cancels. What a mask leaves out has an alpha of 0: to skip it would be to wait for its opacity
+    before anything else of the row is loaded.
     """
-    l11, l21, l22 = tl.load(row + 2), tl.load(row + 3), tl.load(row + 4)
+    l11, l21, l22, log_opacity = tl.load(row + 2), tl.load(row + 3), tl.load(row + 4), tl.load(row + 5)
     dx, dy = x - tl.load(row), y - tl.load(row + 1)
     w1, w2 = l11 * dx + l21 * dy, l22 * dy
     exponent = log_opacity - (w1 * w1 + w2 * w2) * _HALF
-    return tl.where(exponent > FAINT, tl.exp2(exponent), 0.0), (dx, dy, w1, w2, l11, l21, l22)
+    return tl.where(exponent > _FAINT, tl.exp2(exponent), 0.0), (dx, dy, w1, w2, l11, l21, l22, log_opacity)
 
 
 @triton.jit
-def geometry_sums(slope, geometry, log_opacity):
+def geometry_sums(slope, geometry):
     """Carry the gradients of ln alpha at the pixels, ``slope``, to x, y, l11, l21, l22 and the opacity.
 
     As the pixel's offset is dx = pixel - x, the derivatives of ln alpha are l11 w1 in x, l21 w1 + l22 w2 in y, -w1 dx,
     -w1 dy, -w2 dy in the factor, and 1 / o in the opacity.
     """
-    dx, dy, w1, w2, l11, l21, l22 = geometry
+    dx, dy, w1, w2, l11, l21, l22, log_opacity = geometry
     s1, s2 = slope * w1, slope * w2
     along, across = tl.sum(s1), tl.sum(s2)
     to_factor = -tl.sum(s1 * dx), -tl.sum(s1 * dy), -tl.sum(s2 * dy)

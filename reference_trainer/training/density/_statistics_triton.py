@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from reference_trainer.render.triton.tiles import launch
+from reference_trainer.render.triton.launching import kernel, launch
 
 __all__ = ["count_gradients"]
 
@@ -25,7 +25,7 @@ def _norm(gradient, j, stride, real, half_width, half_height):
     return longer * tl.sqrt(1 + ratio * ratio)
 
 
-@triton.jit(do_not_specialize=["count", "stride", "absolute_stride", "half_width", "half_height"])
+@kernel
 def add_gradients(
     indices, touched, gradient, absolute, sums, steps, absolute_sums, count, stride, absolute_stride,
     half_width, half_height, ABSOLUTE: tl.constexpr, BLOCK: tl.constexpr,

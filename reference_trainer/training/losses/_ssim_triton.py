@@ -16,7 +16,8 @@ import triton.language as tl
 from torch import Tensor
 
 from ca_reg.functional.expected_losses import ROUNDING
-from reference_trainer.render.triton.tiles import launch, store3
+from reference_trainer.render.triton.launching import kernel, launch
+from reference_trainer.render.triton.tiles import store3
 from reference_trainer.training.losses._ssim_constants import C1, C2, WEIGHTS
 
 __all__ = ["photometric_loss", "ssim_map"]
@@ -69,7 +70,7 @@ def _error(image, target, variance, place, inside, EXPECTED: tl.constexpr):
     return error, by_image, by_variance, x, y
 
 
-@triton.jit(do_not_specialize=["width", "height"])
+@kernel
 def blur_images(
     image, target, variance, blurred, width, height,
     EXPECTED: tl.constexpr, WIDE: tl.constexpr, HIGH: tl.constexpr,
@@ -93,7 +94,7 @@ def blur_images(
     tl.store(blurred + plane + 3 * size + place, mean_squares, mask=inside)
 
 
-@triton.jit(do_not_specialize=["width", "height"])
+@kernel
 def compare_images(
     blurred, image, target, variance, slopes, out, width, height, of_error, of_ssim,
     EXPECTED: tl.constexpr, LOSS: tl.constexpr, WIDE: tl.constexpr, HIGH: tl.constexpr,
@@ -125,7 +126,7 @@ def compare_images(
         tl.store(out + plane + place, ssim, mask=inside)
 
 
-@triton.jit(do_not_specialize=["width", "height"])
+@kernel
 def blur_slopes(slopes, blurred, width, height, WIDE: tl.constexpr, HIGH: tl.constexpr):
     """Blur along the rows: the window is symmetric and the padding is zero, so the blur is its own transpose."""
     x, _y, place, inside, plane, size = _tile(width, height, WIDE, HIGH)
@@ -135,7 +136,7 @@ def blur_slopes(slopes, blurred, width, height, WIDE: tl.constexpr, HIGH: tl.con
     store3(blurred + plane, place, size, inside, to_mean, to_squares, to_product)
 
 
-@triton.jit(do_not_specialize=["width", "height"])
+@kernel
 def gather_gradients(
     blurred, image, target, variance, upstream, to_image, to_variance, width,
     height, of_error, of_ssim, EXPECTED: tl.constexpr, LOSS: tl.constexpr, WIDE: tl.constexpr,

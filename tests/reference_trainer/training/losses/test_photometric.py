@@ -98,7 +98,7 @@ def test_float32_losses_agree_with_float64(size, spread):
 
 @pytest.mark.skipif(not CHOSEN, reason="counts the launches of Triton's kernels")
 def test_float32_takes_two_launches_and_two_back():
-    from reference_trainer.render.triton.tiles import LAUNCHED
+    from reference_trainer.render.triton.launching import LAUNCHED
 
     image, target = (x.to(DEVICE) for x in pair(5, 6, dtype=torch.float32))
     before = LAUNCHED.total()
