@@ -14,7 +14,7 @@ import tyro
 from benchmarks.paper.cells import Grid, listing, run_cells
 from benchmarks.paper.claims import chosen
 from benchmarks.paper.comparison import RowStore
-from benchmarks.paper.figure import gains_figure, ranking_figure
+from benchmarks.paper.figure import course_figure, gains_figure, ranking_figure
 from benchmarks.paper.page import details, page
 from benchmarks.paper.scenes import chosen_scenes
 from reference_trainer.cli.options import Device, Rendering, RenderOptions
@@ -62,8 +62,8 @@ class Paper:
     pages: tuple[Path, ...] = ()
     """Update these Markdown files with what is kept, between their marks; train nothing."""
     figure: Path | None = None
-    """Plot the effect of dropout and noise against their strength and the number of views, or, with --claims, rank the
-    settings of these by what they gain; train nothing."""
+    """Plot the effect of dropout and noise against their strength and the number of views. With --claims, plot the
+    course of the trainings that they are about, or else rank their settings by what they gain. Train nothing."""
     out: Path = Path("runs/paper")
     """Folder for the trainings, each removed once its row is kept."""
     rows: Path | None = None
@@ -86,7 +86,9 @@ class Paper:
         for path in self.pages:
             write_text(path, page(path.read_text("utf-8"), store))
         if self.figure is not None:
-            ranking_figure(store, self.claims, self.figure) if self.claims else gains_figure(store, self.figure)
+            courses = self.claims and all("path" in claim.needs for claim in claims.values())
+            of_claims = course_figure if courses else ranking_figure
+            of_claims(store, self.claims, self.figure) if self.claims else gains_figure(store, self.figure)
         if self.pages or self.figure:
             return
         if self.list:

@@ -1,4 +1,4 @@
-"""Figures of the claims: gains against strength and number of views, and settings ranked by their gain."""
+"""Figures of the claims: gains by strength and number of views, settings ranked by their gain, courses of trainings."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.paper.claims import GAINS, Check
-from benchmarks.paper.comparison import RowStore, differences, interval, ranked
+from benchmarks.paper.cells import SIXTHS
+from benchmarks.paper.claims import CLAIMS, GAINS, Check
+from benchmarks.paper.comparison import RowStore, differences, interval, ranked, tested
+from benchmarks.paper.rows import Row, value
 from reference_trainer.evaluation.style import COLORS, WIDTH, new_figure, readable
 
-__all__ = ["gains_figure", "ranking_figure"]
+__all__ = ["course_figure", "gains_figure", "ranking_figure"]
 
 _FIGURES = ("test psnr", "gain in PSNR (dB)", 1.0), ("test ca_exact_half", "change of exact CA (%)", 0.01)
 _DASHES = ".-", ".--"
+_COURSE = ("path", "CA (1e-3)", 1e-3), ("course psnr/test", "PSNR (dB)", 1.0)
 
 
 def gains_figure(store: RowStore, path: Path) -> None:
@@ -96,6 +99,48 @@ def ranking_figure(store: RowStore, names: Sequence[str], path: Path) -> None:
         for panel, (_, title, _) in zip(grid[-1], _FIGURES, strict=True):
             panel.set_xlabel(title)
         _legend_below(figure, grid[:, 0])
+
+
+def course_figure(store: RowStore, names: Sequence[str], path: Path) -> None:
+    """Plot CA and PSNR of test views at every sixth of the steps, with two standard errors, by claim and scene.
+
+    Args:
+        store: the rows.
+        names: of claims about the course of trainings. A scene with a single seed is left out.
+        path: the PNG or SVG to write.
+
+    Raises:
+        ValueError: if a claim has no scene with two seeds.
+        ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
+    """
+    columns = list[tuple[str, list[list[Row]]]]()
+    for name in names:
+        claim, before = CLAIMS[name], len(columns)
+        system = readable(str(claim.settings[0].get("recipe", store.recipe)))
+        for scene in tested(claim, store):
+            rows = [[*store.of(scene, setting).values()] for setting in claim.settings]
+            if min(map(len, rows)) > 1:
+                columns.append((f"{readable(scene)}\n{system}", rows))
+        if len(columns) == before:
+            raise ValueError(f"{store.folder} has no two seeds of the settings of claim {name}: nothing to plot.")
+    # Settings are told apart by their regularizers: what else they have stands above the panels.
+    labels = [readable(str(x.get("regularizer", "plain"))) for x in CLAIMS[names[0]].settings]
+    sixths = range(1, SIXTHS + 1)
+    with new_figure(path) as figure:
+        figure.set_size_inches(WIDTH, 4.6)
+        grid = figure.subplots(len(_COURSE), len(columns), sharex=True, squeeze=False)
+        for column, (title, rows) in zip(grid.T, columns, strict=True):
+            column[0].set_title(title)
+            column[-1].set_xlabel("sixths of the steps")
+            for panel, (of, _, unit) in zip(column, _COURSE, strict=True):
+                for label, seeds, color in zip(labels, rows, COLORS, strict=False):
+                    ends = [interval([value(row, f"{of} {sixth}") / unit for row in seeds]) for sixth in sixths]
+                    means, errors = zip(*ends, strict=True)
+                    panel.errorbar(sixths, means, errors, fmt=".-", color=color, label=label, capsize=2)
+                panel.set_xticks(sixths)
+        for row, (_, title, _) in zip(grid, _COURSE, strict=True):
+            row[0].set_ylabel(title)
+        _legend_below(figure, grid[0])
 
 
 def _colors(store: RowStore) -> dict[str, str]:

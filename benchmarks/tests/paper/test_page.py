@@ -15,7 +15,7 @@ from benchmarks.paper import figure as figure_module
 from benchmarks.paper.cells import Grid, declared, estimate, is_done, rows_of
 from benchmarks.paper.claims import CLAIMS, Check, Claim, chosen
 from benchmarks.paper.comparison import RowStore, differences, judged
-from benchmarks.paper.figure import gains_figure, ranking_figure
+from benchmarks.paper.figure import course_figure, gains_figure, ranking_figure
 from benchmarks.paper.page import claims_table, details, gains, page, scenes_table
 from benchmarks.paper.rows import Rows, resolved, value
 from benchmarks.paper.scenes import chosen_scenes
@@ -226,6 +226,26 @@ def test_the_ranking_plots_the_best_setting_first_and_the_score_beside_it(store,
     (errors,) = gained.containers[0][2]
     assert np.allclose(np.ptp(errors.get_segments()[1], 0), (4 / math.sqrt(3), 0.0))  # 3, 4 and 5 dB
     assert np.allclose(score.lines[0].get_xdata(), (math.nan, -75.0), equal_nan=True)
+
+
+def test_the_course_of_trainings_is_plotted_where_two_seeds_are_kept(store, figures):
+    with pytest.raises(ValueError, match="claim late: nothing"):
+        course_figure(store, ["late"], store.folder / "course.png")
+    rows = Rows(store.folder / "b.json")  # of a there is no noise
+    for seed in range(2):
+        for regularizer in ({}, {"regularizer": "dropout(0.2)"}, {"regularizer": "noise(0.8)"}):
+            course = {str(sixth): (sixth + seed) * (1e-3 if not regularizer else 5e-4) for sixth in range(1, 7)}
+            shown = {"psnr/test": {sixth: 1e4 * x for sixth, x in course.items()}}
+            rows.add(row(20.0, seed, **regularizer) | {"path": course, "course": shown})
+    course_figure(RowStore(store.folder), ["late"], store.folder / "course.png")
+    ca, psnr = figures[0].axes
+    assert [bars.get_label() for bars in ca.containers] == ["plain", "dropout 0.2", "opacity noise 0.8"]
+    plain, dropout, _ = (bars[0].get_xydata() for bars in ca.containers)
+    assert np.allclose(plain, [(sixth, sixth + 0.5) for sixth in range(1, 7)])
+    assert np.allclose(dropout[:, 1], plain[:, 1] / 2)
+    assert np.allclose(psnr.containers[0][0].get_ydata(), 10 * plain[:, 1])
+    (errors,) = ca.containers[0][2]
+    assert np.allclose(np.ptp(errors.get_segments()[1], 0), (0.0, 2.0))  # of two seeds 1 apart, two errors each way
 
 
 @pytest.mark.parametrize(
