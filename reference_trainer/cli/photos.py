@@ -311,12 +311,12 @@ class Run:
 
         if (self.folder / run.RESULTS).exists():
             return "Trained and measured before."
-        full, factor, new, steps, measured = self._sizes(scene), options.downscale or 1.0, 0, 0.0, 1
+        full, factor, new, steps, measured = self._sizes(scene), options.downscale or 1.0, False, 0.0, 1
         for folder, own in self._members(config):
             begun = (folder / run.CHECKPOINT).exists()
             left = own.iterations - (load_checkpoint(folder / run.CHECKPOINT)["step"] if begun else 0)
             steps += left * (_WARPED if "warp(" in own.loss else 1)
-            new += not begun
+            new |= not begun
         if self.members > 1:  # the last training is of steps that render several models
             steps, measured = steps + _DISTILLED, self.members + 1
         sizes = {path: (max(1, round(w / factor)), max(1, round(h / factor))) for path, (w, h) in full.items()}
@@ -331,7 +331,7 @@ class Run:
             times["poses"] = core / (_REFERENCE * pixels) * work
         if new and self._makes_dense_start(options, count, posed=posed):
             matched = sum(math.prod(matched_size(*size)) for size in sizes.values())
-            times["points"] = new * core * _MATCHED * matched / pixels
+            times["points"] = core * _MATCHED * matched / pixels  # kept for the other members
         times["training"] = step * _TRAINING * steps
         times["scores and page"] = measured * step * _SHOWN * 3 * min(count, 8)
         parts = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in times.items())
