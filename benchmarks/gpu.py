@@ -1,4 +1,4 @@
-"""The first minute on a card: tests, agreement, times, memory, launches, as a table to paste into an issue.
+"""The first minutes on a card: agreement, times, memory, launches, trainings, tests, as tables to paste into an issue.
 
     python -m benchmarks.gpu          # everything that this machine can do; what fails is named, and the rest goes on
     python -m benchmarks.gpu ahead    # without a card: all kernels compiled for all targets (or for those named)
@@ -29,6 +29,8 @@ from benchmarks.counts import Model, counts_table, lists_table
 from ca_reg import CAScore
 from ca_reg.functional import Multiplier
 from ca_reg.neighbors import nearest_neighbors
+from reference_trainer.evaluation.metrics import view_psnr
+from reference_trainer.model.gaussians import SH_C0
 from reference_trainer.render import (
     describe_engine,
     rasterize,
@@ -38,14 +40,23 @@ from reference_trainer.render import (
     use_engine,
     variance_shares,
 )
+from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.synthetic import synthetic_scene
 from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.recipes import with_recipe
 from reference_trainer.training.trainer import Trainer
 
 __all__ = ["main"]
 ROOT = Path(__file__).resolve().parents[1]
 _HALF = Multiplier.dropout(0.5)
 _COMPARED = (3_000, 128, 0.03)  # Gaussians, pixels along a side, size: float64 takes a processor seconds
+_COLUMNS = "| workload | work | engine | ms, median of 20 | the card works, ms | peak MiB | launches | waits |"
+_STEPS = 1_000
+_TRAININGS: dict[str, tuple[str, dict[str, Any]]] = {
+    "dropout": ("3dgs", {"dropout": 0.2}),
+    "the expectation, guarded": ("sparse", {}),
+    "Binocular3DGS, dropout": ("binocular", {"dropout": 0.2}),
+}
 _SIZES = {"small": (20_000, 400, 0.02), "middle": (100_000, 800, 0.012), "large": (500_000, 800, 0.006)}
 
 
@@ -88,61 +99,95 @@ def _tests() -> str:
 
 
 def _times(on: str = "cuda") -> Iterator[str]:
-    """Yield milliseconds, peak memory, kernel launches and waits of renders, gradients, masks, scores and steps."""
-    device = torch.device(on)
-    yield "| workload | work | engine | ms, median of 20 | peak MiB | launches | waits |"
-    yield "|:--|:--|:--|---:|---:|---:|---:|"
+    """Yield what renders, gradients, masks, scores, neighbors and steps take of time and memory; launches and waits."""
+    yield _COLUMNS
+    yield f"|:--|:--|:--|{'---:|' * (_COLUMNS.count('|') - 4)}"
     for name, size in _SIZES.items():
-        model = Model.of(*size, device)
-        keep = (torch.rand(5, size[0], device=device) > 0.5).float()
-        score = CAScore.exact(model.moments, drop_rate=0.5)
-
-        def forward() -> Any:
-            return rasterize(splat(*model.tensors[:4], model.camera, colors=model.tensors[4])).image  # noqa: B023
-
-        def backward() -> Any:
-            leaves = [x.clone().requires_grad_() for x in model.tensors]  # noqa: B023
-            rasterize(splat(*leaves[:4], model.camera, colors=leaves[4])).image.square().sum().backward()  # noqa: B023
-
-        def drawn(opacity: Tensor, camera: Any) -> tuple[Tensor, Tensor]:
-            out = rasterize(splat(*model.tensors[:3], opacity, camera, colors=model.tensors[4]))  # noqa: B023
-            return out.image, out.alpha
-
-        def masks() -> Any:
-            splats = splat(*model.tensors[:4], model.camera, colors=model.tensors[4])  # noqa: B023
-            return render_masks(splats, model.tensors[3] * keep)  # noqa: B023
-
-        works = {
-            "render": torch.no_grad()(forward),
-            "render and gradients": backward,
-            "five masks": torch.no_grad()(masks),
-            "score of five renders": partial(CAScore(drawn), model.tensors[3], model.camera),
-            "exact score": partial(score, model.tensors[3], model.camera),
-        }
-        for engine in ("triton", *(["torch"] if name == "small" else [])):
-            use_engine(engine)
-            for label, work in works.items():
-                yield f"| {name} | {label} | {engine} | {' | '.join(_measure(work))} |"
-        neighbors = partial(nearest_neighbors, model.tensors[0], 10)
-        yield f"| {name} | 10 neighbors of all | - | {' | '.join(_measure(neighbors))} |"
-        try:
-            yield from _gsplat_times(name, model)
-        except Exception as error:
-            yield f"| {name} | all | gsplat | FAILED: {_first_line(error)} | | | |"
+        model = Model.of(*size, on)
+        yield from _times_of(name, model, ("triton", "torch") if name == "small" else ("triton",))
+        yield f"| {name} | 10 neighbors of all | - | {_measure(partial(nearest_neighbors, model.tensors[0], 10))} |"
     use_engine("triton")
-    trainer = Trainer(synthetic_scene(), TrainConfig(dropout=0.2), device)
-    yield f"| built-in scene | training step, dropout | triton | {' | '.join(_measure(trainer.train_step))} |"
+    trainer = Trainer(synthetic_scene(), TrainConfig(dropout=0.2), on)
+    yield f"| built-in scene | training step, dropout | triton | {_measure(trainer.train_step)} |"
 
 
-def _measure(work: Callable[[], Any]) -> list[str]:
-    """Return the median time, the peak of memory, launches and waits of a call, as text; or what it failed with."""
+def _times_of(name: str, model: Model, engines: Sequence[str]) -> Iterator[str]:
+    """Yield a row for each work on a model by each engine, and by gsplat where it is installed."""
+    means, quaternions, scales, opacities, colors = model.tensors
+    keep = (torch.rand(5, len(means), device=means.device) > 0.5).float()
+    score = CAScore.exact(model.moments, drop_rate=0.5)
+
+    def forward() -> Any:
+        return rasterize(splat(*model.tensors[:4], model.camera, colors=colors)).image
+
+    def backward() -> Any:
+        leaves = [x.clone().requires_grad_() for x in model.tensors]
+        rasterize(splat(*leaves[:4], model.camera, colors=leaves[4])).image.square().sum().backward()
+
+    def drawn(opacity: Tensor, camera: Any) -> tuple[Tensor, Tensor]:
+        out = rasterize(splat(means, quaternions, scales, opacity, camera, colors=colors))
+        return out.image, out.alpha
+
+    def masks() -> Any:
+        return render_masks(splat(*model.tensors[:4], model.camera, colors=colors), opacities * keep)
+
+    works = {
+        "render": torch.no_grad()(forward),
+        "render and gradients": backward,
+        "five masks": torch.no_grad()(masks),
+        "score of five renders": partial(CAScore(drawn), opacities, model.camera),
+        "exact score": partial(score, opacities, model.camera),
+    }
+    for engine in engines:
+        use_engine(engine)
+        for label, work in works.items():
+            yield f"| {name} | {label} | {engine} | {_measure(work)} |"
     try:
-        return _measured(work)
+        yield from _gsplat_times(name, model)
+    except Exception as error:
+        yield f"| {name} | all | gsplat | FAILED: {_first_line(error)} | | | | |"
+
+
+def _trainings(on: str = "cuda") -> Iterator[str]:
+    """Yield what trainings of the built-in scene take and reach, and what work on the model of the first takes."""
+    use_engine("triton")
+    scene, trained = synthetic_scene(), list[Trainer]()
+    yield f"| {_STEPS} steps | with compiling, s | a step of the second half, ms | Gaussians | PSNR of test views, dB |"
+    yield "|:--|---:|---:|---:|---:|"
+    for label, (recipe, settings) in _TRAININGS.items():
+        try:
+            trainer = Trainer(scene, with_recipe(recipe, iterations=_STEPS, **settings), on)
+            trainer.train(until=_STEPS // 2)
+            half = trainer.seconds
+            trainer.train()
+            model, views = model_of(trainer), [view.to(on) for view in scene.test]
+            with torch.no_grad():
+                psnr = statistics.fmean(view_psnr(model.test_rendering(view).image, view) for view in views)
+        except Exception as error:  # name it, and go on with the next
+            yield f"| {label} | FAILED: {_first_line(error)} | | | |"
+            continue
+        trained.append(trainer)
+        step = (trainer.seconds - half) / (_STEPS - _STEPS // 2)
+        yield f"| {label} | {trainer.seconds:.1f} | {1e3 * step:.1f} | {len(trainer.gaussians)} | {psnr:.1f} |"
+    for trainer in trained[:1]:
+        camera = scene.test[0].camera.to(on, torch.float32)
+        x = trainer.gaussians.map(Tensor.detach).params(camera)
+        colors = 0.5 + SH_C0 * x.sh[:, 0]
+        model = Model([x.means, x.quaternions, x.scales, x.opacities, colors], camera)
+        yield from ("", _COLUMNS, f"|:--|:--|:--|{'---:|' * (_COLUMNS.count('|') - 4)}")
+        yield from _times_of("trained", model, ("triton",))
+
+
+def _measure(work: Callable[[], Any]) -> str:
+    """Return the cells of a call, from its time on; or what it failed with."""
+    try:
+        return " | ".join(_measured(work))
     except Exception as error:  # name it, and measure the next
-        return [f"FAILED: {_first_line(error)}", "", "", ""]
+        return f"FAILED: {_first_line(error)} | | | |"
 
 
 def _measured(work: Callable[[], Any]) -> list[str]:
+    """Return the median time of a call, what of it the card works, the peak of memory, launches and waits."""
     for _ in range(3):
         work()
     times = []
@@ -160,8 +205,9 @@ def _measured(work: Callable[[], Any]) -> list[str]:
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         work()
         torch.cuda.synchronize()
-    on_card = (x for x in profile.events() if x.device_type == torch.autograd.DeviceType.CUDA)
+    on_card = [x for x in profile.events() if x.device_type == torch.autograd.DeviceType.CUDA]
     kernels = sum(not x.name.startswith(("Memcpy", "Memset")) for x in on_card)
+    busy = sum(x.device_time for x in on_card) / 1e3
     torch.cuda.set_sync_debug_mode("warn")
     try:
         with warnings.catch_warnings(record=True) as caught:
@@ -170,7 +216,7 @@ def _measured(work: Callable[[], Any]) -> list[str]:
     finally:
         torch.cuda.set_sync_debug_mode("default")
     waits = sum("synchronizing" in str(x.message) for x in caught)
-    return [f"{statistics.median(times):.2f}", f"{peak:.0f}", str(kernels), str(waits)]
+    return [f"{statistics.median(times):.2f}", f"{busy:.2f}", f"{peak:.0f}", str(kernels), str(waits)]
 
 
 def _gsplat_times(name: str, model: Model) -> Iterator[str]:
@@ -196,7 +242,7 @@ def _gsplat_times(name: str, model: Model) -> Iterator[str]:
     }
     label = f"gsplat {gsplat.__version__}"
     for what, work in works.items():
-        yield f"| {name} | {what} | {label} | {' | '.join(_measure(work))} |"
+        yield f"| {name} | {what} | {label} | {_measure(work)} |"
 
 
 def _rasterize(gsplat: Any, model: Model, *tensors: Tensor) -> Any:
@@ -286,7 +332,13 @@ def main(arguments: list[str]) -> int:
     if arguments:
         sections = {arguments[0]: alone[arguments[0]]}
     elif torch.cuda.is_available():
-        sections = {"agreement": _agreement, "times": _times, "count": counts_table, "tests on the card": _tests}
+        sections = {
+            "agreement": _agreement,
+            "times": _times,
+            "trainings": _trainings,
+            "count": counts_table,
+            "tests on the card": _tests,
+        }
         print(f"{torch.cuda.get_device_name()}, torch {torch.__version__}, {describe_engine('cuda')}\n")
     else:
         sections = alone

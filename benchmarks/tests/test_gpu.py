@@ -57,9 +57,9 @@ def test_a_measurement_that_failed_is_counted(monkeypatch, capsys):
         raise RuntimeError("out of memory\nand more")
 
     monkeypatch.setattr(gpu, "_measured", refuse)
-    monkeypatch.setattr(gpu, "counts_table", lambda: f"| one | {gpu._measure(None)[0]} |\n| two | 3 |")
+    monkeypatch.setattr(gpu, "counts_table", lambda: f"| one | {gpu._measure(None)} |\n| two | 3 |")
     assert gpu.main(["count"]) == 1
-    assert "| one | FAILED: out of memory |" in capsys.readouterr().out
+    assert "| one | FAILED: out of memory | | | | |" in capsys.readouterr().out
 
 
 CODE = """
@@ -67,7 +67,10 @@ import json, sys
 from types import SimpleNamespace
 from benchmarks import gpu
 
-gpu._COMPARED, gpu._SIZES = (6, 9, 0.3), {"small": (12, 9, 0.3)}
+gpu._COMPARED, gpu._SIZES, gpu._STEPS = (6, 9, 0.3), {"small": (12, 9, 0.3)}, 2
+little = gpu.synthetic_scene(16, 12, points=9)
+gpu.synthetic_scene = lambda: little
+gpu._TRAININGS["nothing"] = "3dgs", {"renderer": "gsplat"}
 gpu.find_spec = lambda name: name  # a gsplat that does not work
 sys.modules["gsplat"] = SimpleNamespace(__version__="1.5.3")
 called = []
@@ -75,10 +78,10 @@ called = []
 def measured(work):
     if getattr(work, "__name__", "") != "train_step":
         work()
-    return ["1", "2", "3", "4"]
+    return ["1", "2", "3", "4", "5"]
 
 gpu._measured = measured
-print(json.dumps([list(gpu._agreement("cpu")), list(gpu._times("cpu"))]))
+print(json.dumps([list(gpu._agreement("cpu")), list(gpu._times("cpu")), list(gpu._trainings("cpu"))]))
 """
 
 
@@ -87,14 +90,18 @@ def test_on_a_card_that_is_an_interpreter():
     environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, "-c", CODE], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-    agreement, times = json.loads(done.stdout.splitlines()[-1])
+    agreement, times, trainings = json.loads(done.stdout.splitlines()[-1])
     for row in agreement[2:4]:
         assert all(float(cell) < 1e-4 for cell in row.split("|")[2:-1])
     assert agreement[4].startswith("| gsplat | FAILED: ")
     assert agreement[-1] == "Deterministic runs agree."
-    columns = {row.count("|") for row in (*agreement[:5], *times)}
-    assert columns == {8}
-    failed = [row for row in times if "FAILED" in row]
+    assert {row.count("|") for row in agreement[:5]} == {8}
+    trained = trainings.index("")
+    assert {row.count("|") for row in (*times, *trainings[trained + 1 :])} == {9}
+    failed = [row for row in (*times, *trainings) if "FAILED" in row]
     assert all("gsplat" in row for row in failed)
-    assert len(failed) == 3
-    assert times[-1] == "| built-in scene | training step, dropout | triton | 1 | 2 | 3 | 4 |"
+    assert len(failed) == 7
+    assert times[-1] == "| built-in scene | training step, dropout | triton | 1 | 2 | 3 | 4 | 5 |"
+    dropout, expectation, binocular = (row.split("|") for row in trainings[2:5])
+    assert [row[4].strip() for row in (dropout, expectation, binocular)] == ["9"] * 3
+    assert all(5 < float(row[5]) < 30 for row in (dropout, expectation, binocular))
