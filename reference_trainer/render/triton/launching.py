@@ -1,4 +1,4 @@
-"""How a kernel is declared and started, in a third of the time that Triton itself takes the host.
+"""How a kernel is declared and started, in half of the time that Triton itself takes the host.
 
 Triton looks at each argument of each launch, for addresses that 16 divides and numbers that are 1 have machine code of
 their own. A picture waits for the host, not for the card, and these kernels gain nothing by such code. So theirs is for
@@ -31,21 +31,21 @@ def kernel(function: Callable[..., None]) -> Any:
     return triton.jit(function, do_not_specialize=[name for name, x in parameters if "constexpr" not in str(x)])
 
 
-def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 1, **constants: Any) -> None:
-    """Start the programs of a grid on the device of the first argument, a tensor; an empty grid is no launch.
+def launch(function: Any, grid: tuple[int, ...], *arguments: Any, warps: int = 1, **constants: Any) -> None:
+    """Start a kernel's programs on the device of the first argument, a tensor; an empty grid is no launch.
 
     Among the constants may be options of the compiler.
     """
     if min(grid) <= 0:
         return
-    LAUNCHED[kernel.fn.__name__] += 1
+    LAUNCHED[function.fn.__name__] += 1
     types = (x.dtype for x in arguments if isinstance(x, Tensor))
-    key = kernel.fn, arguments[0].device, warps, *constants.items(), *types
+    key = function.fn, arguments[0].device, warps, *constants.items(), *types
     with torch.cuda.device_of(arguments[0]):  # type: ignore[no-untyped-call]
         if key in _COMPILED:
             compiled, values = _COMPILED[key]
             compiled[(*grid, 1, 1)[:3]](*arguments, *values)
             return
-        compiled = kernel[grid](*arguments, num_warps=warps, enable_fp_fusion=True, **constants)
+        compiled = function[grid](*arguments, num_warps=warps, enable_fp_fusion=True, **constants)
         if compiled is not None:  # the interpreter compiles nothing
-            _COMPILED[key] = compiled, [constants[name] for name in kernel.arg_names[len(arguments) :]]
+            _COMPILED[key] = compiled, [constants[name] for name in function.arg_names[len(arguments) :]]
