@@ -116,7 +116,7 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
 
     Args:
         grid: what to run.
-        running: where and how; its ``monitor_every`` is replaced.
+        running: where and how; what is monitored is what the trainings are measured for.
 
     Returns:
         Failures by the name of the training. The same call tries them again.
@@ -125,8 +125,8 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
         ValueError: if a scene has no test views.
         FileNotFoundError: if there is no such scene.
     """
-    first = replace(grid, seeds=FEW_SEEDS)
-    failed = run_cells(first, running) if grid.sequential and grid.seeds > FEW_SEEDS else {}
+    few = replace(grid, seeds=FEW_SEEDS)
+    failed = run_cells(few, running) if grid.sequential and grid.seeds > FEW_SEEDS else {}
     rows = rows_of(grid)
     left = [
         replace(cell, needs=cell.needs | EXTRAS & (_row_of(cell, rows) or {}).keys())
@@ -154,20 +154,16 @@ def run_cells(grid: Grid, running: Running) -> dict[str, Failure]:
                 rows[cell.scene].add(row.value)
                 shutil.rmtree(run.out)
 
-    def do(runs: list[Run], every: int) -> None:
-        for run, end in zip(
-            runs, run_grid(runs, replace(running, monitoring=Monitoring(every, protocol=True)), done=keep), strict=True
-        ):
-            failed.update({run.label: end} if isinstance(end, Failure) else {})
-
     against = dict.fromkeys(cell.scene for cell in left if "depth" in cell.needs)
     denser = config_of(resolved({}, "3dgs", DENSER * grid.iterations), 0)
     photographed = {name: scene for name in against if (scene := grid.scenes[name]).options.path != "synthetic"}
-    do([Run(f"{name}, dense", x.dense, denser, grid.out / name / "dense") for name, x in photographed.items()], 0)
-    for seed in range(grid.seeds):
-        for path in (True, False):  # whether CA is monitored
-            of = [cell for cell in left if cell.seed == seed and ("path" in cell.needs) == path]
-            do([_run(grid, cell) for cell in of], max(1, grid.iterations // SIXTHS) if path else 0)
+    references = [
+        Run(f"{name}, dense", x.dense, denser, grid.out / name / "dense", Monitoring(0))
+        for name, x in photographed.items()
+    ]
+    for runs in (references, [_run(grid, cell) for cell in left]):
+        for run, end in zip(runs, run_grid(runs, running, done=keep), strict=True):
+            failed.update({run.label: end} if isinstance(end, Failure) else {})
     return failed
 
 
@@ -291,10 +287,11 @@ def folder_of(grid: Grid, cell: Cell) -> Path:
 
 
 def _run(grid: Grid, cell: Cell) -> Run:
-    """Return a training as a run of `run_grid`."""
+    """Return a training as a run of `run_grid`, whose CA is monitored if its course is asked for."""
     config = config_of(cell.setting, cell.seed)
     options = grid.scenes[cell.scene].options_for(cell.setting, config.loss)
-    return Run(cell.name, options, config, folder_of(grid, cell))
+    every = max(1, grid.iterations // SIXTHS) if "path" in cell.needs else 0
+    return Run(cell.name, options, config, folder_of(grid, cell), Monitoring(every, protocol=True))
 
 
 def _mean(of: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -24,12 +24,16 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Run:
-    """One run of a grid: its label for messages, its scene and training, and its folder, unique within the grid."""
+    """One run of a grid: its label for messages, its scene and training, and its folder, unique within the grid.
+
+    What is measured and saved on the way is what the grid says, or what the run itself says.
+    """
 
     label: str
     options: SceneOptions
     config: TrainConfig
     out: Path
+    monitoring: Monitoring | None = None
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,7 @@ def run_grid(
         else:
             run.out.mkdir(parents=True, exist_ok=True)
             lpips = running.lpips if running.lpips in (None, "installed") else str(Path(running.lpips).resolve())
-            how = {"device": running.device, "lpips": lpips, "monitoring": running.monitoring}
+            how = {"device": running.device, "lpips": lpips, "monitoring": run.monitoring or running.monitoring}
             tasks[number] = Task(run.label, train_run, (*_where(run), chosen_engine(), how))
     numbers = list(tasks)
     for index, outcome in run_all(running.executor, list(tasks.values()), retries=running.retries):

@@ -239,7 +239,7 @@ def test_the_course_of_trainings_is_plotted_where_two_seeds_are_kept(store, figu
             rows.add(row(20.0, seed, **regularizer) | {"path": course, "course": shown})
     course_figure(RowStore(store.folder), ["late"], store.folder / "course.png")
     ca, psnr = figures[0].axes
-    assert [bars.get_label() for bars in ca.containers] == ["plain", "dropout 0.2", "opacity noise 0.8"]
+    assert [bars.get_label() for bars in ca.containers] == ["without a regularizer", "dropout 0.2", "opacity noise 0.8"]
     plain, dropout, _ = (bars[0].get_xydata() for bars in ca.containers)
     assert np.allclose(plain, [(sixth, sixth + 0.5) for sixth in range(1, 7)])
     assert np.allclose(dropout[:, 1], plain[:, 1] / 2)
