@@ -17,10 +17,12 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -51,7 +53,7 @@ ROOT = Path(__file__).resolve().parents[1]
 _HALF = Multiplier.dropout(0.5)
 _COMPARED = (3_000, 128, 0.03)  # Gaussians, pixels along a side, size: float64 takes a processor seconds
 _COLUMNS = "| workload | work | engine | ms, median of 20 | the card works, ms | peak MiB | launches | waits |"
-_STEPS = 1_000
+_STEPS, _CALLS = 1_000, 200
 _TRAININGS: dict[str, tuple[str, dict[str, Any]]] = {
     "dropout": ("3dgs", {"dropout": 0.2}),
     "the expectation, guarded": ("sparse", {}),
@@ -176,6 +178,45 @@ def _trainings(on: str = "cuda") -> Iterator[str]:
         model = Model([x.means, x.quaternions, x.scales, x.opacities, colors], camera)
         yield from ("", _COLUMNS, f"|:--|:--|:--|{'---:|' * (_COLUMNS.count('|') - 4)}")
         yield from _times_of("trained", model, ("triton",))
+
+
+def _launches(on: str = "cuda") -> Iterator[str]:
+    """Yield what the start of each kernel of a picture and its gradients takes the host, by Triton and directly."""
+    from reference_trainer.render.triton import binning, compositing, launching, projection, tiles
+
+    use_engine("triton")
+    model, calls = Model.of(*_SIZES["small"], on), list[tuple[tuple[Any, ...], dict[str, Any]]]()
+
+    def noted(*arguments: Any, **constants: Any) -> None:
+        calls.append((arguments, constants))
+        launching.launch(*arguments, **constants)
+
+    with ExitStack() as stack:
+        for module in (projection, binning, tiles, compositing):
+            stack.enter_context(patch.object(module, "launch", noted))
+        leaves = [x.clone().requires_grad_() for x in model.tensors]
+        rasterize(splat(*leaves[:4], model.camera, colors=leaves[4])).image.sum().backward()
+    yield "| kernel | arguments | started by Triton, us of the host | directly, us |"
+    yield "|:--|---:|---:|---:|"
+    for (function, grid, *arguments), constants in calls:
+        options = {name: x for name, x in constants.items() if name != "warps"} | {"enable_fp_fusion": True}
+        ways = (
+            partial(function[grid], *arguments, num_warps=constants.get("warps", 1), **options),
+            partial(launching.launch, function, grid, *arguments, **constants),
+        )
+        cells = [f"{1e6 * _host_seconds(way, on):.1f}" for way in ways]
+        yield f"| {function.fn.__name__} | {len(function.arg_names)} | {' | '.join(cells)} |"
+
+
+def _host_seconds(work: Callable[[], Any], on: str) -> float:
+    """Return what one of many calls takes the host, which does not wait for them."""
+    work()
+    if on != "cpu":
+        torch.cuda.synchronize()
+    begun = time.perf_counter()
+    for _ in range(_CALLS):
+        work()
+    return (time.perf_counter() - begun) / _CALLS
 
 
 def _measure(work: Callable[[], Any]) -> str:
@@ -335,6 +376,7 @@ def main(arguments: list[str]) -> int:
         sections = {
             "agreement": _agreement,
             "times": _times,
+            "launches": _launches,
             "trainings": _trainings,
             "count": counts_table,
             "tests on the card": _tests,

@@ -67,7 +67,7 @@ import json, sys
 from types import SimpleNamespace
 from benchmarks import gpu
 
-gpu._COMPARED, gpu._SIZES, gpu._STEPS = (6, 9, 0.3), {"small": (12, 9, 0.3)}, 2
+gpu._COMPARED, gpu._SIZES, gpu._STEPS, gpu._CALLS = (6, 9, 0.3), {"small": (12, 9, 0.3)}, 2, 1
 little = gpu.synthetic_scene(16, 12, points=9)
 gpu.synthetic_scene = lambda: little
 gpu._TRAININGS["nothing"] = "3dgs", {"renderer": "gsplat"}
@@ -81,7 +81,8 @@ def measured(work):
     return ["1", "2", "3", "4", "5"]
 
 gpu._measured = measured
-print(json.dumps([list(gpu._agreement("cpu")), list(gpu._times("cpu")), list(gpu._trainings("cpu"))]))
+sections = gpu._agreement, gpu._times, gpu._trainings, gpu._launches
+print(json.dumps([list(section("cpu")) for section in sections]))
 """
 
 
@@ -90,7 +91,7 @@ def test_on_a_card_that_is_an_interpreter():
     environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, "-c", CODE], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-    agreement, times, trainings = json.loads(done.stdout.splitlines()[-1])
+    agreement, times, trainings, launches = json.loads(done.stdout.splitlines()[-1])
     for row in agreement[2:4]:
         assert all(float(cell) < 1e-4 for cell in row.split("|")[2:-1])
     assert agreement[4].startswith("| gsplat | FAILED: ")
@@ -105,3 +106,7 @@ def test_on_a_card_that_is_an_interpreter():
     dropout, expectation, binocular = (row.split("|") for row in trainings[2:5])
     assert [row[4].strip() for row in (dropout, expectation, binocular)] == ["9"] * 3
     assert all(5 < float(row[5]) < 30 for row in (dropout, expectation, binocular))
+    kernels = [row.split("|")[1].strip() for row in launches[2:]]
+    assert kernels[:3] == ["find_visible", "index_visible", "project_forward"]
+    assert kernels[-2:] == ["composite_backward", "project_backward"]
+    assert all(float(cell) > 0 for row in launches[2:] for cell in row.split("|")[2:-1])
