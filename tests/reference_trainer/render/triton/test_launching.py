@@ -7,14 +7,12 @@ pytest.importorskip("triton")
 
 from triton import language as tl
 
-from reference_trainer.render.triton import launching
 from reference_trainer.render.triton.launching import LAUNCHED, kernel, launch
 
 
 @pytest.fixture
-def calls(monkeypatch):
+def calls():
     """Every start: by whom, the grid, the arguments in order, and the options and constants by name."""
-    monkeypatch.setattr(launching, "_COMPILED", {})
     return []
 
 
