@@ -160,9 +160,9 @@ def exact_mean(
     """
     mean, variance, _ = moments
     visible, spread = alpha > threshold, variance.mean(0).to(torch.float64)
-    sums = [x.sum(dtype=torch.float64) for x in (mean, variance, alpha)]
-    found = torch.stack([*sums, _highest(alpha).double(), *_visible_sums(spread, visible)])
-    *totals, highest, pixels, total = found.tolist()
+    # The first three are only asked whether they are finite: in double precision each would copy a picture.
+    seen = torch.stack([mean.sum(), variance.sum(), alpha.sum(), _highest(alpha)])
+    *totals, highest, pixels, total = torch.cat([seen, torch.stack(_visible_sums(spread, visible))]).tolist()
     _check_highest(highest)
     if all(math.isfinite(x) for x in totals):
         return spread, visible, *_mean_or_reason(pixels, total, broken, 1.0)
