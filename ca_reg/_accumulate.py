@@ -68,7 +68,10 @@ class RenderMoments:
         squares = (self._squares[:used] * visible).sum(-1).double().sum(-1)
         rows = (self._sums[:used] * visible).flatten(1, 2).transpose(0, 1)
         products = torch.bmm(rows, rows.mT).double().sum(0)
-        sizes = (self.count - 1 - torch.arange(used, device=products.device)) // self._groups + 1
+        # The rest is about a few numbers, each operation a launch on a card: read once, it is left to the processor.
+        sums = torch.cat([squares, products.flatten(), visible.sum(dtype=torch.float64)[None]]).cpu()
+        squares, products, pixels = sums[:used], sums[used:-1].view(used, used), float(sums[-1])
+        sizes = (self.count - 1 - torch.arange(used, device=sums.device)) // self._groups + 1
         rest, ratios = (self.count - sizes).to(products), (self.count / sizes).to(products)
         others = products.sum() - 2 * products.sum(0) + products.diagonal()
         left_out = (squares.sum() - squares - others / rest) / (rest - 1)
@@ -77,7 +80,7 @@ class RenderMoments:
         # The jackknife estimate: pseudo-values weighted by their groups' shares of the renders.
         center = (pseudo / ratios).sum()
         spread = ((pseudo - center).square() / (ratios - 1)).mean()
-        return float(spread.sqrt()) / (3 * int(visible.sum()))
+        return float(spread.sqrt()) / (3 * pixels)
 
 
 class Deviations:
