@@ -52,7 +52,10 @@ __all__ = ["main"]
 ROOT = Path(__file__).resolve().parents[1]
 _HALF = Multiplier.dropout(0.5)
 _COMPARED = (3_000, 128, 0.03)  # Gaussians, pixels along a side, size: float64 takes a processor seconds
-_COLUMNS = "| workload | work | engine | ms, median of 20 | the card works, ms | peak MiB | launches | waits |"
+_HEAD = (
+    "| workload | work | engine | ms, median of 20 | the card works, ms | peak MiB | launches | waits |",
+    "|:--|:--|:--|---:|---:|---:|---:|---:|",
+)
 _STEPS, _CALLS = 1_000, 200
 _TRAININGS: dict[str, tuple[str, dict[str, Any]]] = {
     "dropout": ("3dgs", {"dropout": 0.2}),
@@ -102,8 +105,7 @@ def _tests() -> str:
 
 def _times(on: str = "cuda") -> Iterator[str]:
     """Yield what renders, gradients, masks, scores, neighbors and steps take of time and memory; launches and waits."""
-    yield _COLUMNS
-    yield f"|:--|:--|:--|{'---:|' * (_COLUMNS.count('|') - 4)}"
+    yield from _HEAD
     for name, size in _SIZES.items():
         model = Model.of(*size, on)
         yield from _times_of(name, model, ("triton", "torch") if name == "small" else ("triton",))
@@ -171,12 +173,12 @@ def _trainings(on: str = "cuda") -> Iterator[str]:
         trained.append(trainer)
         step = (trainer.seconds - half) / (_STEPS - _STEPS // 2)
         yield f"| {label} | {trainer.seconds:.1f} | {1e3 * step:.1f} | {len(trainer.gaussians)} | {psnr:.1f} |"
-    for trainer in trained[:1]:
+    if trained:
         camera = scene.test[0].camera.to(on, torch.float32)
-        x = trainer.gaussians.map(Tensor.detach).params(camera)
+        x = trained[0].gaussians.map(Tensor.detach).params(camera)
         colors = 0.5 + SH_C0 * x.sh[:, 0]
         model = Model([x.means, x.quaternions, x.scales, x.opacities, colors], camera)
-        yield from ("", _COLUMNS, f"|:--|:--|:--|{'---:|' * (_COLUMNS.count('|') - 4)}")
+        yield from ("", *_HEAD)
         yield from _times_of("trained", model, ("triton",))
 
 
