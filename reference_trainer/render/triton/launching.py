@@ -1,4 +1,4 @@
-"""How a kernel is declared and started, in half of the time that Triton itself takes the host.
+"""How a kernel is declared and started, with less work for the host than by Triton itself.
 
 Triton looks at each argument of each launch, for addresses that 16 divides and numbers that are 1 have machine code of
 their own. A picture waits for the host, not for the card, and these kernels gain nothing by such code. So theirs is for
