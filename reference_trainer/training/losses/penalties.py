@@ -23,22 +23,30 @@ class Alpha(WeightedTerm):
         weight: at least 0, or a schedule.
         dark: threshold of `dark_background`, which then takes the place of one minus the photograph's alpha.
             DNGaussian and Binocular3DGS use 30/255 on DTU, 15/255 for scan 110.
+        optional: whether the term is left out where no photograph has an alpha channel, instead of refusing them.
     """
 
-    def __init__(self, weight: float | Schedule = 1.0, dark: float | None = None) -> None:
+    def __init__(self, weight: float | Schedule = 1.0, dark: float | None = None, optional: bool = False) -> None:
         super().__init__(weight)
         if dark is not None and not 0 < dark <= 1:
             raise ValueError(f"dark must be in (0, 1], got {dark}.")
-        self.dark = dark
+        self.dark, self.optional = dark, optional
+        self._left_out = False
         self._backgrounds: dict[str, Tensor] = {}
 
     def begin(self, scene: Scene) -> None:
-        """Refuse photographs without alpha if ``dark`` is not given."""
-        if self.dark is None and (lacking := [view.name for view in scene.train if view.alpha is None]):
+        """Refuse photographs without alpha, or leave the term out, unless ``dark`` is given."""
+        lacking = [] if self.dark is not None else [view.name for view in scene.train if view.alpha is None]
+        self._left_out = self.optional and len(lacking) == len(scene.train)
+        if lacking and not self._left_out:
             raise ValueError(
                 f"{lacking} have no alpha channel, which alpha compares with: write alpha(dark=0.118) if the "
                 "background is black."
             )
+
+    def acts(self, number: int) -> bool:
+        """Return whether the photographs have what it compares with, and the weight at this step is not 0."""
+        return not self._left_out and super().acts(number)
 
     def value(self, step: Step) -> Tensor:
         """Return the mean over all pixels."""

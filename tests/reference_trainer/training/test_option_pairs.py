@@ -51,7 +51,7 @@ OPTIONS: dict[str, dict[str, object]] = {
 }
 NEEDS = {"compensate": "dropout", "clip": "noise", "scale": "noise"}
 REFUSED = {
-    ("analytic", "recipe binocular"): "analytic training has no draw, which Warp needs",
+    ("analytic", "recipe binocular"): "analytic training has no draw, which Alpha, Warp needs",
     ("analytic", "renderer"): "analytic training needs the moments of the builtin renderer",
     ("loss", "renderer"): "the loss needs moments, which the renderer gsplat lacks",
 }

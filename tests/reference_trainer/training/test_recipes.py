@@ -196,7 +196,7 @@ def test_rates_and_thresholds(scene, name):
 # Weights of the terms by iteration, of the train.py and arguments of each.
 WEIGHTS = {
     "fsgs": {"Pearson": lambda i: 0.001 if i > 9_500 else 0.05},
-    "binocular": {"Warp": lambda i: float(i > 20_000)},
+    "binocular": {"Alpha": lambda i: 1.0, "Warp": lambda i: float(i > 20_000)},
     "dngaussian": {  # the photometric loss is 1.2 times ours; 0.01 is ours, the passes begin where theirs do
         "PatchDepth": lambda i: 0.01 + 0.01 * (i > 1_000),
         "Flat": lambda i: 0.002 / 1.2,

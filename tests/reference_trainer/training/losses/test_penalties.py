@@ -58,6 +58,16 @@ def test_arguments_and_photographs(three_views, tiny_scene):
     Alpha(dark=0.1).begin(dataclasses.replace(tiny_scene, train=(opaque,)))
 
 
+def test_an_optional_alpha_is_left_out_where_no_photograph_has_one(three_views, tiny_scene):
+    opaque = dataclasses.replace(three_views[1], alpha=None)
+    for train, acts in (((opaque,), False), (three_views[:1], True)):
+        term = Alpha(optional=True)
+        term.begin(dataclasses.replace(tiny_scene, train=train))
+        assert term.acts(0) is acts
+    with pytest.raises(ValueError, match=r"\['b'\] .*no alpha"):
+        Alpha(optional=True).begin(dataclasses.replace(tiny_scene, train=(three_views[0], opaque)))
+
+
 @pytest.mark.parametrize("limit", [1.0, 4.0, 1e6])
 def test_it_is_the_mean_excess_of_the_ratio(six, take_step, limit):
     scales = np.exp(six.log_scales.numpy())
