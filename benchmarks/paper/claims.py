@@ -156,6 +156,9 @@ _TRIPLED = _with(loss="photometric + views(3)")
 _BINOCULAR = _with(recipe="binocular")
 _ABSOLUTE = _with(recipe="binocular", density="absgrad")
 _LASTING = _with(recipe="binocular", opacity_decay=1.0)
+_WITHOUT_ALPHA = tuple(
+    {"recipe": "binocular", "loss": "photometric + warp(between(1.0, 6667))", **setting} for setting in _THREE
+)
 
 _SYSTEMS = _three_ways("3dgs", "dngaussian", "fsgs", "corgs", "binocular")
 _FURTHER = _three_ways("mvgs", "absgs")
@@ -256,6 +259,12 @@ CLAIMS = {
                     *(Check("path 5", {**_BINOCULAR, **each}, {**_BINOCULAR, **each}, high=0.1, to="path 4",
                             relative=True) for each in (_DROPOUT, _NOISE))),
                    _COURSE, ("fern",), frozenset({"path"})),
+    "alpha": Claim("without its alpha term Binocular3DGS loses PSNR on photographs with an alpha channel", "",
+                   (*_three_ways("binocular"), *_WITHOUT_ALPHA),
+                   tuple(_lower(_PSNR, *pair)
+                         for pair in zip(_WITHOUT_ALPHA, _three_ways("binocular"), strict=True)),
+                   (_PSNR, _CA, *(f"{of} {sixth}" for of in ("path", "course psnr/test") for sixth in (4, 5))),
+                   ("lego",), frozenset({"path"})),
     "exact": Claim("the exact score beside the paper's protocol", "", _THREE,
                    shows=(_CA, "test ca_exact", "test ca_exact_half", "train ca", "train ca_exact"), scenes=_EVERY),
     "scaled": Claim("after noise, too, opacities scaled by their mean factor are better than plain ones", "", (_NOISE,),
@@ -320,10 +329,11 @@ CLAIMS |= {
     "size-binocular": _with_recipe("binocular", CLAIMS["size"], *PAPER_SIZE),
     "size-late": replace(CLAIMS["late"], scenes=tuple(PAPER_SIZE)),
     "size-onset": replace(CLAIMS["onset"], scenes=tuple(PAPER_SIZE)),
+    "size-alpha": replace(CLAIMS["alpha"], scenes=("lego-400",)),
 }
 """The seventeen claims by their number, then further questions of the field by name."""
 
-AT_PAPER_SIZE = ("size", "size-binocular", "size-late", "size-onset")
+AT_PAPER_SIZE = ("size", "size-binocular", "size-late", "size-onset", "size-alpha")
 """Those that have a page of their own."""
 
 GAINS: Mapping[str, Mapping[str, Mapping[float, tuple[Setting, Setting]]]] = {
