@@ -329,7 +329,7 @@ CLAIMS |= {
     "size-binocular": _with_recipe("binocular", CLAIMS["size"], *PAPER_SIZE),
     "size-late": replace(CLAIMS["late"], scenes=tuple(PAPER_SIZE)),
     "size-onset": replace(CLAIMS["onset"], scenes=tuple(PAPER_SIZE)),
-    "size-alpha": replace(CLAIMS["alpha"], scenes=("lego-400",)),
+    "size-alpha": replace(CLAIMS["alpha"], settings=_WITHOUT_ALPHA, checks=(), scenes=("lego-400",)),
 }
 """The seventeen claims by their number, then further questions of the field by name."""
 

@@ -68,14 +68,14 @@ def claims_table(store: RowStore) -> str:
 
 
 def details(name: str, store: RowStore) -> str:
-    """Return the table of a claim's settings and its checks for every scene with half of the settings or more."""
+    """Return the table of a claim's settings and its checks for every scene with more than half of the settings."""
     claim, parts = CLAIMS[name], []
     for scene in tested(claim, store):
         found = {}
         for setting in claim.settings:
             if of := [row for row in store.of(scene, setting).values() if claim.needs <= row.keys()]:
                 found[name_of(setting, store)] = of
-        if 2 * len(found) >= len(claim.settings):
+        if 2 * len(found) > len(claim.settings):
             about = store.scenes[scene].content.get("about", "")
             parts.append(f"**{scene}**: {about}\n\n{_table(found, claim.shows)}")
             lines = [
