@@ -73,7 +73,8 @@ class WeightedTerm(LossTerm):
     def __call__(self, step: Step) -> Tensor:
         """Return the weighted value."""
         # The schedule is asked again at every step: it is a function of the step, and of nothing else.
-        return self._weight(step.number) * self.value(step)
+        weight, value = self._weight(step.number), self.value(step)
+        return value if weight == 1 else weight * value
 
     @abc.abstractmethod
     def value(self, step: Step) -> Tensor:
