@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d, pad
 
@@ -23,7 +24,7 @@ class Alpha(WeightedTerm):
         weight: at least 0, or a schedule.
         dark: threshold of `dark_background`, which then takes the place of one minus the photograph's alpha.
             DNGaussian and Binocular3DGS use 30/255 on DTU, 15/255 for scan 110.
-        optional: whether the term is left out where no photograph has an alpha channel, instead of refusing them.
+        optional: whether a photograph without an alpha channel is all foreground, instead of being refused.
     """
 
     def __init__(self, weight: float | Schedule = 1.0, dark: float | None = None, optional: bool = False) -> None:
@@ -35,17 +36,17 @@ class Alpha(WeightedTerm):
         self._backgrounds: dict[str, Tensor] = {}
 
     def begin(self, scene: Scene) -> None:
-        """Refuse photographs without alpha, or leave the term out, unless ``dark`` is given."""
+        """Refuse photographs without alpha if neither ``dark`` is given nor the term optional."""
         lacking = [] if self.dark is not None else [view.name for view in scene.train if view.alpha is None]
-        self._left_out = self.optional and len(lacking) == len(scene.train)
-        if lacking and not self._left_out:
+        self._left_out = len(lacking) == len(scene.train)
+        if lacking and not self.optional:
             raise ValueError(
                 f"{lacking} have no alpha channel, which alpha compares with: write alpha(dark=0.118) if the "
                 "background is black."
             )
 
     def acts(self, number: int) -> bool:
-        """Return whether the photographs have what it compares with, and the weight at this step is not 0."""
+        """Return whether any photograph has what it compares with, and the weight at this step is not 0."""
         return not self._left_out and super().acts(number)
 
     def value(self, step: Step) -> Tensor:
@@ -61,8 +62,7 @@ class Alpha(WeightedTerm):
         """Return 1 where a photograph shows the background, (H, W)."""
         if self.dark is not None:
             return dark_background(view.image, self.dark)
-        assert view.alpha is not None
-        return 1 - view.alpha
+        return torch.zeros_like(view.image[0]) if view.alpha is None else 1 - view.alpha
 
 
 def dark_background(image: Tensor, threshold: float) -> Tensor:
