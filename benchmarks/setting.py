@@ -224,8 +224,7 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
         ]
         return " + ".join([*changes, *(name for steps, name in _STEPS.items() if steps == config.iterations)]) or CHOSEN
     if "warp" in config.loss:
-        of = {", dropout": config.dropout, ", alpha": "+ alpha +" in config.loss, RELATIVE: "relative" in config.loss}
-        return "Binocular3DGS" + "".join(text for text, known in of.items() if known)
+        return "Binocular3DGS" + ", dropout" * bool(config.dropout) + RELATIVE * ("relative" in config.loss)
     name = "dropout" if config.dropout else "noise" if config.noise else "plain"
     return name + (f", {LATER}" if begins == 1_000 else "")
 
