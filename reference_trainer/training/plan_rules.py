@@ -14,6 +14,7 @@ from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.assembly import make_density, make_losses, make_regularizer
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.losses import Photometric
+from reference_trainer.training.losses.depth import Warp
 from reference_trainer.training.losses.penalties import Alpha
 from reference_trainer.training.model_state import initial_gaussians, seen_by_any
 
@@ -59,12 +60,16 @@ def sh_bands(scene: Scene, config: TrainConfig) -> PlanItem:
 
 
 def alpha_masks(scene: Scene, config: TrainConfig) -> PlanItem:
-    """Alpha masks: the pictures lie on the background already."""
+    """Alpha masks: the pictures lie on the background already, but a warp fills what is transparent with fog."""
     masks = [view.alpha for view in scene.train if view.alpha is not None]
     if not masks:
         return PlanItem("alpha masks", "left out", "by construction: no training picture has one")
-    if any(isinstance(term, Alpha) and term.dark is None for term in make_losses(config)):
+    losses = make_losses(config)
+    if any(isinstance(term, Alpha) and term.dark is None for term in losses):
         return PlanItem("alpha masks", "used", "asked for: Alpha compares with them")
+    if any(isinstance(term, Warp) for term in losses):
+        reason = "Warp agrees with fog where pictures are transparent (lego: 20 in place of 24 dB): add alpha to loss"
+        return PlanItem("alpha masks", "recommended", reason)
     empty = sum(float((alpha == 0).float().mean()) for alpha in masks) / len(masks)
     reason = f"by construction: the pictures, {empty:.0%} of them empty, lie on the background already"
     return PlanItem("alpha masks", "left out", reason)

@@ -195,11 +195,23 @@ def test_a_step_renders_no_depth_and_no_dropped_gaussian(tiny_scene, monkeypatch
     ],
 )
 def test_what_a_training_uses_is_not_said_to_be_left_out(tiny_scene, name, config, said):
-    masked = tuple(dataclasses.replace(view, alpha=torch.ones_like(view.image[0])) for view in tiny_scene.train)
-    scene = dataclasses.replace(tiny_scene, train=masked) if name == "alpha masks" else tiny_scene
+    scene = masked(tiny_scene) if name == "alpha masks" else tiny_scene
     item = items(scene, config)[name]
     assert (item.decision, item.changes) == ("used", {})
     assert re.search(said, item.reason)
+
+
+def masked(scene):
+    """Give every photograph an alpha channel."""
+    train = tuple(dataclasses.replace(view, alpha=torch.ones_like(view.image[0])) for view in scene.train)
+    return dataclasses.replace(scene, train=train)
+
+
+def test_a_warp_of_transparent_pictures_is_recommended_an_alpha_term(tiny_scene):
+    config = TrainConfig(loss="photometric + warp")
+    assert items(tiny_scene, config)["alpha masks"].decision == "left out"
+    plan = make_plan(masked(tiny_scene), config)
+    assert re.search(r"^Recommended, alpha masks: .*add alpha", plan.summary(), re.MULTILINE)
 
 
 @pytest.mark.parametrize("iterations", [500, 501, 600, 601, 650])
