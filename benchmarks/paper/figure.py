@@ -127,7 +127,7 @@ def course_figure(store: RowStore, names: Sequence[str], path: Path) -> None:
     labels = [readable(str(x.get("regularizer", "plain"))) for x in CLAIMS[names[0]].settings]
     sixths = range(1, SIXTHS + 1)
     with new_figure(path) as figure:
-        figure.set_size_inches(WIDTH, 4.6)
+        figure.set_size_inches(max(WIDTH, 1.8 * len(columns)), 4.6)
         grid = figure.subplots(len(_COURSE), len(columns), sharex=True, squeeze=False)
         for column, (title, rows) in zip(grid.T, columns, strict=True):
             column[0].set_title(title)
