@@ -233,9 +233,7 @@ def _planned(
         return config
     plan = make_plan(scene, config, given=given, device=device)
     write_json(out / PLAN, plan.as_dict())
-    for row in plan.rows():
-        if row["change"] == "-" and row["decision"] != "recommended":
-            continue
+    for row in (each for each in plan.rows() if each["change"] != "-" or each["decision"] == "recommended"):
         _log.info("plan: %s %s (%s): %s", row["item"], row["decision"], row["change"], row["reason"])
     _log.info("plan: all decisions, with reasons, are in %s", out / PLAN)
     return plan.applied(config, given=given)
