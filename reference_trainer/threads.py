@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["chosen_threads", "thread_count", "threads_for"]
+__all__ = ["chosen_threads", "processors", "thread_count", "threads_for"]
 
 PIXELS_PER_THREAD = 65_536
 """A picture of less than twice this gets one thread. Its steps are many operations of microseconds, each of which ends
@@ -18,6 +18,17 @@ def chosen_threads() -> int | None:
     """Return the number of threads that the user has set in ``OMP_NUM_THREADS``, or None."""
     word = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # a list is for nested regions
     return int(word) if word.isdecimal() and int(word) > 0 else None
+
+
+def processors() -> int:
+    """Return how many processors this process may run on, in a container perhaps fewer than the machine has.
+
+    Example:
+        >>> processors() >= 1
+        True
+    """
+    affinity = getattr(os, "sched_getaffinity", None)  # Linux
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def thread_count(pixels: int | None = None, *, jobs: int = 1) -> int:
@@ -33,15 +44,13 @@ def thread_count(pixels: int | None = None, *, jobs: int = 1) -> int:
     chosen = chosen_threads()
     if chosen is not None:
         return chosen
-    affinity = getattr(os, "sched_getaffinity", None)  # Linux: fewer than the machine has, in a container or by taskset
-    processors = len(affinity(0)) if affinity else os.cpu_count() or 1
-    most = max(1, processors // jobs)
+    most = max(1, processors() // jobs)
     return most if pixels is None else min(most, max(1, pixels // PIXELS_PER_THREAD))
 
 
 @contextmanager
-def threads_for(pixels: int) -> Iterator[None]:
-    """Limit PyTorch to `thread_count` threads for pictures of ``pixels`` pixels within a block.
+def threads_for(pixels: int, *, jobs: int = 1) -> Iterator[None]:
+    """Limit PyTorch within a block to the `thread_count` of the same arguments.
 
     Example:
         >>> import torch
@@ -52,7 +61,7 @@ def threads_for(pixels: int) -> Iterator[None]:
     import torch
 
     before = torch.get_num_threads()  # perhaps fewer: one for --deterministic, a worker's share
-    torch.set_num_threads(min(before, thread_count(pixels)))
+    torch.set_num_threads(min(before, thread_count(pixels, jobs=jobs)))
     try:
         yield
     finally:

@@ -22,6 +22,7 @@ from reference_trainer.cli.options import Device, Rendering, RenderOptions
 from reference_trainer.json_files import read_json
 from reference_trainer.runs import folder as run
 from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.threads import chosen_threads, processors
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import with_recipe
 
@@ -149,10 +150,10 @@ class Run:
                 self._begin_again()
         print(self._forecast(scene, options, config), flush=True)
         self._poses(scene)
-        for folder, own in self._members(config):
-            run_experiment(options, own, folder, auto=True, device=self.device, progress=True)
-        if self.members > 1:
-            run_experiment(*distilled(self._trained), self.folder, device=self.device, progress=True)
+        if several := self.members > 1:
+            self._train_members(options, config)
+            options, config = distilled(self._trained)
+        run_experiment(options, config, self.folder, auto=not several, device=self.device, progress=True)
         self._report()
 
     def _photographs(self) -> Path:
@@ -296,6 +297,28 @@ class Run:
         settings = (member_settings(config, number, self.members) for number in range(self.members))
         return [*zip(self._trained, settings, strict=True)]
 
+    @property
+    def _jobs(self) -> int:
+        """How many trainings run side by side: as many as there are, if each has a processor."""
+        return min(self.members, max(1, processors() // (chosen_threads() or 1)))
+
+    def _train_members(self, options: SceneOptions, config: TrainConfig) -> None:
+        """Train the models that the last training learns from, side by side."""
+        from reference_trainer.runs import grid
+        from reference_trainer.runs.executors import Failure, Processes
+        from reference_trainer.scenes.load import load_scene
+
+        if not all((folder / run.RESULTS).exists() for folder in self._trained):
+            load_scene(options)  # with its dense start, which is kept: else each would make its own
+        models = [
+            grid.Run(f"model {number}", options, own, folder)
+            for number, (folder, own) in enumerate(self._members(config), start=1)
+        ]
+        running = grid.Running(Processes(self._jobs), device=self.device, auto=True, progress=True)
+        for model, outcome in zip(models, grid.run_grid(models, running), strict=True):
+            if isinstance(outcome, Failure):
+                raise RuntimeError(f"{model.label} failed, {outcome.error} The same command tries it again.")
+
     def _forecast(self, scene: Path, options: SceneOptions, config: TrainConfig) -> str:
         """Return how long what is still to be done will take, from a few training steps on this machine.
 
@@ -311,18 +334,20 @@ class Run:
 
         if (self.folder / run.RESULTS).exists():
             return "Trained and measured before."
-        full, factor, new, steps, measured = self._sizes(scene), options.downscale or 1.0, False, 0.0, 1
+        full, factor, new, measured = self._sizes(scene), options.downscale or 1.0, False, 1
+        busy = [0.0] * self._jobs  # for so many steps
         for folder, own in self._members(config):
             begun = (folder / run.CHECKPOINT).exists()
             left = own.iterations - (load_checkpoint(folder / run.CHECKPOINT)["step"] if begun else 0)
-            steps += left * (_WARPED if "warp(" in own.loss else 1)
+            busy[busy.index(min(busy))] += left * (_WARPED if "warp(" in own.loss else 1)
             new |= not begun
+        steps = max(busy)
         if self.members > 1:  # the last training is of steps that render several models
-            steps, measured = steps + _DISTILLED, self.members + 1
+            steps, measured = steps + _DISTILLED, math.ceil(self.members / self._jobs) + 1
         sizes = {path: (max(1, round(w / factor)), max(1, round(h / factor))) for path, (w, h) in full.items()}
         count, usual = len(sizes), _usual(sizes.values())
         pixels = statistics.fmean(map(math.prod, sizes.values()))
-        step = step_seconds(*usual, self.device) * pixels / math.prod(usual)
+        step = step_seconds(*usual, self.device, jobs=self._jobs) * pixels / math.prod(usual)
         core = step if self.device == "cpu" else _REFERENCE * pixels  # cameras and points are found by the processor
         times, posed = {}, scene == self.photos or bool(colmap_folders(scene))
         if not posed:

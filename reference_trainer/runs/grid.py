@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -46,6 +47,8 @@ class Running:
         device: where to train.
         monitoring: what is measured and saved on the way.
         lpips: perceptual metric of the evaluation: None, ``"installed"``, or a weights file.
+        auto: leave out what the scene does not need (`make_plan`).
+        progress: whether the first run that is trained shows a progress bar.
 
     Raises:
         ValueError: if ``retries`` is negative.
@@ -56,6 +59,8 @@ class Running:
     device: str = "cpu"
     monitoring: Monitoring = Monitoring()  # noqa: RUF009, frozen
     lpips: str | None = None
+    auto: bool = False
+    progress: bool = False
 
     def __post_init__(self) -> None:
         if self.retries < 0:
@@ -84,18 +89,19 @@ def run_grid(
     tasks: dict[int, Task] = {}
     for number, run in enumerate(runs):
         if (run.out / RESULTS).exists():
-            note(number, _read(run), "before")
+            note(number, _read(run, running), "before")
         else:
             run.out.mkdir(parents=True, exist_ok=True)
             lpips = running.lpips if running.lpips in (None, "installed") else str(Path(running.lpips).resolve())
             how = {"device": running.device, "lpips": lpips, "monitoring": run.monitoring or running.monitoring}
+            how |= {"auto": running.auto, "progress": running.progress and not tasks}
             tasks[number] = Task(run.label, train_run, (*_where(run), chosen_engine(), how))
     numbers = list(tasks)
     for index, outcome in run_all(running.executor, list(tasks.values()), retries=running.retries):
         note(numbers[index], outcome, "now")
     for number in numbers:  # a run that failed here because another sweep held its folder may be finished by now
         if isinstance(outcomes[number], Failure) and (runs[number].out / RESULTS).exists():
-            note(number, _read(runs[number]), "meanwhile")
+            note(number, _read(runs[number], running), "meanwhile")
     return [outcomes[number] for number in range(len(runs))]
 
 
@@ -116,9 +122,10 @@ def train_run(
     return run_experiment(options, config, out, **how)
 
 
-def _read(run: Run) -> Value | Failure:
+def _read(run: Run, running: Running) -> Value | Failure:
     """Return the results of a finished run, or a failure if it has other settings."""
-    return attempt(Task(run.label, run_experiment, _where(run)), torch.get_num_threads())
+    read = functools.partial(run_experiment, auto=running.auto)
+    return attempt(Task(run.label, read, _where(run)), torch.get_num_threads())
 
 
 def _where(run: Run) -> tuple[SceneOptions, TrainConfig, Path]:
