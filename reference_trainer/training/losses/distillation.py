@@ -11,13 +11,16 @@ from ca_reg.regularizers import parse
 from ca_reg.schedules import Schedule
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.ply import load_ply
-from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.scenes.virtual_cameras import unseen_views
 from reference_trainer.training.losses.photometric import check_lambda, photometric_loss
 from reference_trainer.training.losses.term import WeightedTerm
 from reference_trainer.training.step import Step
 
 __all__ = ["Distillation"]
+
+_KEPT = 32
+"""Targets that are not rendered again: three photographs have 27 cameras, half a megapixel takes 6 MB."""
 
 
 class Distillation(WeightedTerm):
@@ -54,6 +57,8 @@ class Distillation(WeightedTerm):
         check_lambda(lambda_dssim)
         self.members, self.lambda_dssim = members, lambda_dssim
         self._models: list[TrainedModel] = []  # read when first asked for
+        self._targets: dict[int, Tensor] = {}  # by the number of the camera, all over one background
+        self._over: Tensor | None = None
 
     def begin(self, scene: Scene) -> None:
         """Choose the cameras; raises a ValueError if there is no member, or fewer than two training views."""
@@ -68,11 +73,22 @@ class Distillation(WeightedTerm):
         generator = step.generator("distillation")
         number = int(torch.randint(len(self.views), (), generator=generator, device=device))
         view = self.views[number].to(device)
-        with torch.no_grad():
-            shown = [replace(each, background=step.background).test_rendering(view).image for each in self._models]
         params = step.regularizer.regularize(step.gaussians.params(view.camera, step=step.number), generator)
-        target = torch.stack(shown).mean(dim=0).clamp(0, 1)
+        target = self._target(number, view, step.background)
         return photometric_loss(step.render(view.camera, params).image, target, self.lambda_dssim)
+
+    @torch.no_grad()
+    def _target(self, number: int, view: View, background: Tensor) -> Tensor:
+        """Return the mean of what the members show at a camera."""
+        if background is not self._over:  # of random ones every step has its own
+            self._over, self._targets = background, {}
+        if number in self._targets:
+            return self._targets[number]
+        shown = [replace(each, background=background).test_rendering(view).image for each in self._models]
+        target = torch.stack(shown).mean(dim=0).clamp(0, 1)
+        if len(self._targets) < _KEPT:
+            self._targets[number] = target
+        return target
 
 
 def _member(path: str, background: Tensor) -> TrainedModel:

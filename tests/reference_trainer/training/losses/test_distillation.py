@@ -8,6 +8,7 @@ import torch
 
 from ca_reg.regularizers import parse
 from reference_trainer.evaluation.metrics import psnr, ssim
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.ply import save_ply
 from reference_trainer.render import render
 from reference_trainer.runs.run import load_run, run_experiment
@@ -62,6 +63,30 @@ def test_every_step_looks_from_a_camera_of_its_own_with_a_draw_of_its_own(scene,
     values = {number: term(take_step(number=number, regularizer=parse("dropout(0.5)"))).item() for number in range(8)}
     assert len(set(values.values())) > 4
     assert term(take_step(number=3, regularizer=parse("dropout(0.5)"))).item() == values[3]
+
+
+def test_what_the_members_show_at_a_camera_is_rendered_once_over_each_background(
+    scene, take_step, members, monkeypatch
+):
+    def value(term, number, background):
+        step = take_step(number=number)
+        step.background = background
+        return term(step).item()
+
+    def new_term():
+        (term,) = LOSSES.make(f"distillation({members[0][0]!r})")
+        term.begin(scene)
+        return term
+
+    shown, rendered = TrainedModel.test_rendering, []
+    monkeypatch.setattr(TrainedModel, "test_rendering", lambda *given: rendered.append(given) or shown(*given))
+    term = new_term()
+    for background in torch.eye(3, dtype=torch.float64)[:2]:
+        rendered.clear()
+        values = [value(term, number, background) for number in range(40)]
+        cameras = len(set(values))  # the model is the same at every step
+        assert len(rendered) == cameras < 40
+        assert values[:8] == [value(new_term(), number, background) for number in range(8)]
 
 
 def test_density_control_does_not_see_it(scene, take_step, members):
