@@ -49,8 +49,8 @@ def thread_count(pixels: int | None = None, *, jobs: int = 1) -> int:
 
 
 @contextmanager
-def threads_for(pixels: int, *, jobs: int = 1) -> Iterator[None]:
-    """Limit PyTorch within a block to the `thread_count` of the same arguments.
+def threads_for(pixels: int) -> Iterator[None]:
+    """Limit PyTorch to `thread_count` threads for pictures of ``pixels`` pixels within a block.
 
     Example:
         >>> import torch
@@ -61,7 +61,7 @@ def threads_for(pixels: int, *, jobs: int = 1) -> Iterator[None]:
     import torch
 
     before = torch.get_num_threads()  # perhaps fewer: one for --deterministic, a worker's share
-    torch.set_num_threads(min(before, thread_count(pixels, jobs=jobs)))
+    torch.set_num_threads(min(before, thread_count(pixels)))
     try:
         yield
     finally:

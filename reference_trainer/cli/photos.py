@@ -22,7 +22,7 @@ from reference_trainer.cli.options import Device, Rendering, RenderOptions
 from reference_trainer.json_files import read_json
 from reference_trainer.runs import folder as run
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.threads import chosen_threads, processors
+from reference_trainer.threads import processors, thread_count
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import with_recipe
 
@@ -84,8 +84,8 @@ class Run:
     """5,000 steps at half a megapixel."""
     members: int = 1
     """Models to train, the others half as long as the first, and to distill into one, which errs less where few
-    photographs look: 2, of other seeds, take 1.8 times as long to train as one; of 3, 2.5 times, the second has slower
-    means and the third Binocular3DGS's warp."""
+    photographs look: 2, of other seeds, take 1.8 times the processor time of one to train; of 3, 2.5 times, the second
+    has slower means and the third Binocular3DGS's warp. They train side by side where processors would be idle."""
     again: Annotated[Step | None, tyro.conf.arg(name="from")] = None
     """Do this step and those after it again: what they wrote is deleted."""
     frames: int = 16
@@ -151,7 +151,8 @@ class Run:
         print(self._forecast(scene, options, config), flush=True)
         self._poses(scene)
         if several := self.members > 1:
-            self._train_members(options, config)
+            if not (self.folder / run.RESULTS).exists():
+                self._train_members(options, config)
             options, config = distilled(self._trained)
         run_experiment(options, config, self.folder, auto=not several, device=self.device, progress=True)
         self._report()
@@ -297,10 +298,9 @@ class Run:
         settings = (member_settings(config, number, self.members) for number in range(self.members))
         return [*zip(self._trained, settings, strict=True)]
 
-    @property
-    def _jobs(self) -> int:
-        """How many trainings run side by side: as many as there are, if each has a processor."""
-        return min(self.members, max(1, processors() // (chosen_threads() or 1)))
+    def _jobs(self, pixels: int) -> int:
+        """Return how many trainings run side by side: as many as have processors for all threads that one uses."""
+        return min(self.members, max(1, processors() // thread_count(pixels)))
 
     def _train_members(self, options: SceneOptions, config: TrainConfig) -> None:
         """Train the models that the last training learns from, side by side."""
@@ -308,13 +308,12 @@ class Run:
         from reference_trainer.runs.executors import Failure, Processes
         from reference_trainer.scenes.load import load_scene
 
-        if not all((folder / run.RESULTS).exists() for folder in self._trained):
-            load_scene(options)  # with its dense start, which is kept: else each would make its own
+        scene = load_scene(options)  # with its dense start, which is kept: else each would make its own
         models = [
             grid.Run(f"model {number}", options, own, folder)
             for number, (folder, own) in enumerate(self._members(config), start=1)
         ]
-        running = grid.Running(Processes(self._jobs), device=self.device, auto=True, progress=True)
+        running = grid.Running(Processes(self._jobs(scene.pixels)), device=self.device, auto=True, progress=True)
         for model, outcome in zip(models, grid.run_grid(models, running), strict=True):
             if isinstance(outcome, Failure):
                 raise RuntimeError(f"{model.label} failed, {outcome.error} The same command tries it again.")
@@ -335,7 +334,9 @@ class Run:
         if (self.folder / run.RESULTS).exists():
             return "Trained and measured before."
         full, factor, new, measured = self._sizes(scene), options.downscale or 1.0, False, 1
-        busy = [0.0] * self._jobs  # for so many steps
+        sizes = {path: (max(1, round(w / factor)), max(1, round(h / factor))) for path, (w, h) in full.items()}
+        count, usual = len(sizes), _usual(sizes.values())
+        busy = [0.0] * (jobs := self._jobs(math.prod(usual)))  # for so many steps
         for folder, own in self._members(config):
             begun = (folder / run.CHECKPOINT).exists()
             left = own.iterations - (load_checkpoint(folder / run.CHECKPOINT)["step"] if begun else 0)
@@ -343,11 +344,9 @@ class Run:
             new |= not begun
         steps = max(busy)
         if self.members > 1:  # the last training is of steps that render several models
-            steps, measured = steps + _DISTILLED, math.ceil(self.members / self._jobs) + 1
-        sizes = {path: (max(1, round(w / factor)), max(1, round(h / factor))) for path, (w, h) in full.items()}
-        count, usual = len(sizes), _usual(sizes.values())
+            steps, measured = steps + _DISTILLED, math.ceil(self.members / jobs) + 1
         pixels = statistics.fmean(map(math.prod, sizes.values()))
-        step = step_seconds(*usual, self.device, jobs=self._jobs) * pixels / math.prod(usual)
+        step = step_seconds(*usual, self.device) * pixels / math.prod(usual)
         core = step if self.device == "cpu" else _REFERENCE * pixels  # cameras and points are found by the processor
         times, posed = {}, scene == self.photos or bool(colmap_folders(scene))
         if not posed:

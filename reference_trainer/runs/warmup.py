@@ -54,10 +54,10 @@ def warm_up() -> tuple[str, ...]:
     return tuple(names)
 
 
-def step_seconds(width: int, height: int, device: str = "cpu", *, jobs: int = 1) -> float:
+def step_seconds(width: int, height: int, device: str = "cpu") -> float:
     """Time a training step on this machine as it is now: photographs of this size, one Gaussian for ten pixels.
 
-    It has the threads of one of ``jobs`` side by side, though it is alone. Call `warm_up` first, or the time includes compilation.
+    Call `warm_up` first, or the time includes compilation.
     """
     scene = synthetic_scene(width=40, height=30, points=max(10, width * height // 10))
     views = tuple(
@@ -65,7 +65,7 @@ def step_seconds(width: int, height: int, device: str = "cpu", *, jobs: int = 1)
         for view in scene.train
     )
     trainer = Trainer(replace(scene, train=views), TrainConfig(dropout=0.2), device)
-    with threads_for(width * height, jobs=jobs):
+    with threads_for(width * height):
         for number in range(_UNTIMED + _TIMED):
             if number == _UNTIMED:
                 begun = time.perf_counter()
