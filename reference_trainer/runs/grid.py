@@ -93,8 +93,8 @@ def run_grid(
         else:
             run.out.mkdir(parents=True, exist_ok=True)
             lpips = running.lpips if running.lpips in (None, "installed") else str(Path(running.lpips).resolve())
-            how = {"device": running.device, "lpips": lpips, "monitoring": run.monitoring or running.monitoring}
-            how |= {"auto": running.auto, "progress": running.progress and not tasks}
+            how: dict[str, Any] = {"device": running.device, "lpips": lpips, "auto": running.auto}
+            how |= {"monitoring": run.monitoring or running.monitoring, "progress": running.progress and not tasks}
             tasks[number] = Task(run.label, train_run, (*_where(run), chosen_engine(), how))
     numbers = list(tasks)
     for index, outcome in run_all(running.executor, list(tasks.values()), retries=running.retries):

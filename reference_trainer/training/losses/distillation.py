@@ -11,7 +11,7 @@ from ca_reg.regularizers import parse
 from ca_reg.schedules import Schedule
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.ply import load_ply
-from reference_trainer.scenes.scene import Scene, View
+from reference_trainer.scenes.scene import Scene, Viewpoint
 from reference_trainer.scenes.virtual_cameras import unseen_views
 from reference_trainer.training.losses.photometric import check_lambda, photometric_loss
 from reference_trainer.training.losses.term import WeightedTerm
@@ -78,7 +78,7 @@ class Distillation(WeightedTerm):
         return photometric_loss(step.render(view.camera, params).image, target, self.lambda_dssim)
 
     @torch.no_grad()
-    def _target(self, number: int, view: View, background: Tensor) -> Tensor:
+    def _target(self, number: int, view: Viewpoint, background: Tensor) -> Tensor:
         """Return the mean of what the members show at a camera."""
         if background is not self._over:  # of random ones every step has its own
             self._over, self._targets = background, {}

@@ -121,7 +121,8 @@ def test_a_grid_of_scenes_strategies_and_seeds(tmp_path, monkeypatch, said):
     def train(options, config, out, engine, how):
         assert engine == chosen_engine()
         lpips = str(Path("weights.pth").resolve())
-        assert how == {"device": "cpu", "monitoring": Monitoring(7, checkpoint_every=9), "lpips": lpips}
+        asked = {"device": "cpu", "monitoring": Monitoring(7, checkpoint_every=9), "lpips": lpips}
+        assert how == asked | {"auto": False, "progress": False}
         assert out.is_dir()
         assert out.is_absolute()
         if (options.path, config.dropout, config.seed) == ("synthetic", 0.2, 1):
