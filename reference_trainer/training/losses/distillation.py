@@ -31,7 +31,7 @@ class Distillation(WeightedTerm):
     hundred steps with this term beside ``photometric`` takes most of that over, with no more Gaussians than it had
     (knowledge distillation, Hinton et al. 2015, arXiv:1503.02531). At each step one of the `unseen_views` is drawn, and
     rendered with a draw of the regularizer; the target is rendered with the test-time opacities. Density control does
-    not see these renders. A step takes two to three times as long, though each target is rendered once.
+    not see these renders. A step takes two to three times as long; the targets of 32 cameras are kept.
 
     Args:
         members: 3DGS .ply files of the models, in the world of the scene, with plain or test-time opacities.
