@@ -48,8 +48,9 @@ RULES: dict[str, dict[str, Any]] = {
     "ratio 8, 0.3 %, together 5 %": {"ratio": 8.0, "alone": 0.003, "together": 0.05},
     "ratio 16, 0.3 %, together 5 %": {"ratio": 16.0, "alone": 0.003, "together": 0.05},
     "pilot: 15 twice": {"ratio": 2.0, "alone": 0.0, "most": 15, "rounds": 2},
+    "by shares": {"ratio": 64.0, "alone": 0.003, "together": 0.2, "by_shares": True},
 }
-"""The rules of the protocol, and the one that was chosen."""
+"""The rules of the protocols, and those that were chosen."""
 
 OTHER_EXPOSURE = {"sceaux": ("7107.jpg",)}
 """Held-out photographs that are no measure."""
@@ -94,7 +95,7 @@ def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
     options, config = read_run_settings(run / "config.json")
     others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(scene.name, ())]
     splits: dict[str, Sequence[View]] = dict(zip(_SPLITS, (others, scene.test, scene.train), strict=True))
-    known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, float]] = {}
+    known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, Tensor, float]] = {}
     rows, of_kept = [], dict[bytes, dict[str, dict[str, float]]]()
     for name in rules:
         start = time.process_time()
@@ -124,7 +125,7 @@ def quality(model: TrainedModel, view: View) -> float:
 def keeps(
     model: TrainedModel,
     scene: Scene,
-    known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, float]],
+    known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, Tensor, float]],
     *,
     ratio: float = 2.0,
     alone: float = 0.0,
@@ -132,6 +133,7 @@ def keeps(
     most: int | None = None,
     rounds: int = 3,
     fewer: bool = False,
+    by_shares: bool = False,
 ) -> tuple[Tensor, list[float], dict[str, int]]:
     """Return what a rule keeps, the score after each round, and where what went had its highest share.
 
@@ -149,9 +151,11 @@ def keeps(
             shares, where_highest, score = unseen_shares(rest, views)
             plain = rest.without_camera
             weights = [blend_weights(plain, of) / len(of) for of in (views, scene.train)]
-            known[key] = shares, where_highest, weights[0], weights[1], score
-        shares, where_highest, there, here, score = known[key]
+            known[key] = shares, where_highest, *weights, unseen_shares(rest, scene.train)[0], score
+        shares, where_highest, there, here, told, score = known[key]
         scores.append(score)
+        if by_shares:
+            there, here = shares, told
         hang = hanging(shares, there, here, ratio=ratio, together=together, alone=alone)
         if most is not None:
             held = torch.where(hang, shares, 0.0)
