@@ -126,10 +126,6 @@ def hanging(
     these, measure again, and stop when none is found. Use it for models that were trained with dropout or noise: in
     others, Gaussians need each other. For the cameras, the numbers and the gain, see benchmarks/guard.md.
 
-    What stands before a background of its own color weighs as much in the photographs as elsewhere. It is found if the
-    weights are replaced by shares, those there and those at the training cameras, with a ``ratio`` of 64 and 0.2
-    ``together``.
-
     Args:
         shares: from :func:`attribute`, averaged over cameras that nobody took, at least 0, shape (N,).
         there: blend weights (alpha times transmittance, summed over the pixels) at these cameras, averaged over them,

@@ -28,8 +28,6 @@ PER_WEIGHT_SCALE = (0.1, 10.0)
 
 _TOP = (0.001, 0.01, 0.1)
 _TOLD = 5  # places that a sentence names
-_BY_SHARES = {"ratio": 64.0, "together": 0.2}
-"""Of `hanging`, with shares of the score in the place of weights; benchmarks/guard.md chose them."""
 
 
 @dataclass(frozen=True)
@@ -103,11 +101,10 @@ def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None =
     """Find the Gaussians that hang where nobody took a photograph, see `ca_reg.attribution.hanging`.
 
     What hangs is left out and the rest measured again, because it may have hidden more, until nothing hangs or
-    ``rounds`` are over. All `unseen_views` are judged together, by weights and by shares: what stands before a
-    background of its own color weighs as much in the photographs as there, but nothing changes in them without it.
-    With many training cameras each of `amid_views` is also judged separately, by weights, because what hangs at one of
-    many places is little in the mean over all. Scores are at the drop rate of the training, at 0.2 if that is 0. No
-    photograph is looked at. Costs about four renders per camera and round.
+    ``rounds`` are over. All `unseen_views` are judged together. With many training cameras each of `amid_views` is
+    also judged separately, because what hangs at one of many places is little in the mean over all. Scores are at the
+    drop rate of the training, at 0.2 if that is 0. No photograph is looked at. Costs about four renders
+    per camera and round.
 
     Args:
         model: which, trained with something that drops or is noisy.
@@ -132,17 +129,14 @@ def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None =
     for number in range(rounds + 1):
         rest = replace(model, gaussians=model.gaussians[keep])
         plain, hang, of_views = rest.without_camera, torch.zeros_like(keep[keep]), list[float]()
-        here, told = blend_weights(plain, taken), unseen_shares(rest, taken)[0]
+        here = blend_weights(plain, taken)
         for of in places:
             shares, where_highest, score = unseen_shares(rest, of)
             of_views += [score] * len(of)
             if number < rounds:
                 # At a single place divided by 3, not by all: what many photographs show is then rarely suspected.
                 mean = here / (len(taken) if of is together else 3)
-                found = hanging(shares, blend_weights(plain, of) / len(of), mean)
-                if of is together:
-                    found |= hanging(shares, shares, told, **_BY_SHARES)
-                found &= ~hang
+                found = hanging(shares, blend_weights(plain, of) / len(of), mean) & ~hang
                 where.update(of[i].name for i in where_highest[found].tolist())
                 hang |= found
         scores.append(sum(of_views) / len(of_views))

@@ -4,7 +4,7 @@ import pytest
 import torch
 from veils import veiled_at
 
-from reference_trainer.evaluation.shares import blend_weights, guard, mean_shares, share_per_weight, unseen_shares
+from reference_trainer.evaluation.shares import blend_weights, guard, mean_shares, share_per_weight
 from reference_trainer.model.ply import load_ply, save_ply
 from reference_trainer.runs import edit_ply
 from reference_trainer.runs.edit_ply import clean_ply, refined
@@ -111,12 +111,7 @@ def test_what_hangs_goes_and_nothing_else(run, options, tmp_path, said):
     left = load_ply(tmp_path / "c.ply").gaussians.means
     expected = guard(dataclasses.replace(model, gaussians=opaque), scene).keep
     assert not expected[-len(veil) :].all()
-    also = ~expected  # of the model itself goes what no photograph tells of: it was trained for a few steps
-    also[-len(veil) :] = False
-    assert also.sum() <= 0.001 * len(also)
-    unveiled = dataclasses.replace(model, gaussians=opaque[expected | also])
-    there, here = (unseen_shares(unveiled, of)[0][also[expected | also]] for of in (unseen_views(scene), scene.train))
-    assert (there > 64 * here).all()
+    assert expected[: -len(veil)].all()
     assert rows(left) == rows(opaque.means[expected])
     assert any("nobody took a photograph" in text for text in said)
 
