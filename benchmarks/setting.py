@@ -106,6 +106,8 @@ ONE_EXPOSURE = "one exposure"
 """What the tenth choice adds: photographs made equally bright, ``--one-exposure``."""
 DISTILLED = {1: "distilled, alone", 2: "distilled of two", 3: "distilled of three"}
 """What the eleventh choice adds, by the number of models."""
+BY_ERROR = ", by error"
+"""What the fourteenth choice adds: targets in which every member weighs by its expected error."""
 TWICE, HALF, THIRD = "twice the steps", "half the steps", "a third of the steps"
 """What takes as long as the second of these, and what the thirteenth choice distills."""
 _STEPS = {6_000: TWICE, 1_500: HALF, 1_000: THIRD}
@@ -235,7 +237,8 @@ def _distilled(loss: str) -> str:
     first, *others = (candidate(read_run_settings(run / "config.json")[1]) for run in runs)
     kinds = [other.removeprefix(f"{LATER} + ") for other in others if other != first]
     steps = [f", {part}" for part in first.split(" + ") if part in _STEPS.values()]
-    return f"distilled with {', '.join(kinds)}" if kinds else "".join([DISTILLED[len(runs)], *steps])
+    name = f"distilled with {', '.join(kinds)}" if kinds else "".join([DISTILLED[len(runs)], *steps])
+    return name + BY_ERROR * ("by_error=True" in loss)
 
 
 def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
