@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from benchmarks import setting
-from benchmarks.failures import failures
+from benchmarks.failures import failures, foreseen
 from benchmarks.tests.test_setting import row
 
 
@@ -25,7 +25,22 @@ def test_a_failure_is_a_decibel_below_the_median_of_its_own_seeds(tmp_path):
     assert "below plain, same seed: 2 of 5" in text
 
 
-def test_the_page_has_the_table_of_its_rows():
+def test_a_shortfall_is_that_of_the_worst_camera():
+    """Of three seeds; the medians of two cameras are 20 and 18."""
+    expected = {24.0: [20.0, 18.5], 22.0: [20.5, 14.0], 23.0: [17.0, 18.0]}
+    rows = [
+        row("fountain, dense and few", "from 1,000", seed, psnr) | {"expected": of}
+        for seed, (psnr, of) in enumerate(expected.items())
+    ]
+    cells = [
+        x.strip() for x in foreseen([*rows, rows[0] | {"scene": "sceaux, dense and few"}]).splitlines()[-1].split("|")
+    ]
+    assert cells[1:5] == ["fountain", "3", "22.00, 23.00, 24.00", "4.0, 3.0, 0.0"]
+    assert cells[5:7] == ["-1.00", "1.00"]
+
+
+def test_the_page_has_the_tables_of_its_rows():
     lines = Path(setting.__file__).with_suffix(".md").read_text("utf-8").splitlines()
     rows = json.loads((setting.REFERENCES.parent / "setting.json").read_text("utf-8"))
-    assert [line for line in failures(rows).splitlines() if line and line not in lines] == []
+    tables = f"{failures(rows)}\n{foreseen(rows)}"
+    assert [line for line in tables.splitlines() if line and line not in lines] == []

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from ca_reg.regularizers import parse
 from ca_reg.schedules import Schedule
-from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.ply import load_ply
 from reference_trainer.scenes.scene import Scene, Viewpoint
@@ -22,9 +21,6 @@ __all__ = ["Distillation"]
 
 _KEPT = 32
 """Targets that are not rendered again: three photographs have 27 cameras, half a megapixel takes 6 MB."""
-
-_LEAST = 1e-3
-"""Error below which a member weighs no more."""
 
 
 class Distillation(WeightedTerm):
@@ -41,8 +37,6 @@ class Distillation(WeightedTerm):
         members: 3DGS .ply files of the models, in the world of the scene, with plain or test-time opacities.
         weight: at least 0, or a schedule.
         lambda_dssim: weight of the structural term, in [0, 1].
-        by_error: whether a member weighs as little at a pixel as its error is expected to be large there, by an
-            `ErrorMap` of its own; else all weigh the same.
 
     Raises:
         ValueError: when the first step is taken, if a file holds no model, or says that it was trained with somebody's
@@ -58,14 +52,11 @@ class Distillation(WeightedTerm):
 
     analytic = True  # it renders draws of its own
 
-    def __init__(
-        self, *members: str, weight: float | Schedule = 1.0, lambda_dssim: float = 0.2, by_error: bool = False
-    ) -> None:
+    def __init__(self, *members: str, weight: float | Schedule = 1.0, lambda_dssim: float = 0.2) -> None:
         super().__init__(weight)
         check_lambda(lambda_dssim)
-        self.members, self.lambda_dssim, self.by_error = members, lambda_dssim, by_error
+        self.members, self.lambda_dssim = members, lambda_dssim
         self._models: list[TrainedModel] = []  # read when first asked for
-        self._maps: list[ErrorMaps] = []  # likewise
         self._targets: dict[int, Tensor] = {}  # by the number of the camera, all over one background
         self._over: Tensor | None = None
 
@@ -73,14 +64,12 @@ class Distillation(WeightedTerm):
         """Choose the cameras; raises a ValueError if there is no member, or fewer than two training views."""
         if not self.members:
             raise ValueError("distillation needs .ply files of models to learn from, best two: distillation('a.ply').")
-        self.views, self._train = unseen_views(scene), scene.train
+        self.views = unseen_views(scene)
 
     def value(self, step: Step) -> Tensor:
         """Compare the model with the mean of the members at one camera."""
         device = step.image.device
-        if not self._models:
-            self._models = [_member(path, step.background) for path in self.members]
-            self._maps = [ErrorMaps(model, self._train) for model in self._models] if self.by_error else []
+        self._models = self._models or [_member(path, step.background) for path in self.members]
         generator = step.generator("distillation")
         number = int(torch.randint(len(self.views), (), generator=generator, device=device))
         view = self.views[number].to(device)
@@ -95,12 +84,8 @@ class Distillation(WeightedTerm):
             self._over, self._targets = background, {}
         if number in self._targets:
             return self._targets[number]
-        shown = torch.stack([replace(x, background=background).test_rendering(view).image for x in self._models])
-        if self.by_error:
-            weight = 1 / torch.stack([maps(view).error for maps in self._maps]).clamp_min(_LEAST)
-            target = ((weight / weight.sum(0))[:, None] * shown).sum(0).clamp(0, 1)
-        else:
-            target = shown.mean(dim=0).clamp(0, 1)
+        shown = [replace(each, background=background).test_rendering(view).image for each in self._models]
+        target = torch.stack(shown).mean(dim=0).clamp(0, 1)
         if len(self._targets) < _KEPT:
             self._targets[number] = target
         return target
