@@ -1,4 +1,4 @@
-"""How often a setting fails, and what foretells it, from the rows of `benchmarks.setting`; see benchmarks/setting.md.
+"""The study of failures, from the rows of `benchmarks.setting`; see benchmarks/setting.md.
 
 python -m benchmarks.failures benchmarks/data/setting.json
 """

@@ -95,7 +95,7 @@ def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
     options, config = read_run_settings(run / "config.json")
     others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(scene.name, ())]
     splits: dict[str, Sequence[View]] = dict(zip(_SPLITS, (others, scene.test, scene.train), strict=True))
-    known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, Tensor, float]] = {}
+    known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, float]] = {}
     rows, of_kept = [], dict[bytes, dict[str, dict[str, float]]]()
     for name in rules:
         start = time.process_time()
@@ -125,7 +125,7 @@ def quality(model: TrainedModel, view: View) -> float:
 def keeps(
     model: TrainedModel,
     scene: Scene,
-    known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, Tensor, float]],
+    known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, float]],
     *,
     ratio: float = 2.0,
     alone: float = 0.0,
@@ -145,17 +145,17 @@ def keeps(
         views = [v for i, v in enumerate(views) if (i % 3 == 1 if v.name.startswith("between") else i % 3 > 0)]
     keep, scores, where = torch.ones(len(model.gaussians), dtype=torch.bool), list[float](), Counter[str]()
     for number in range(rounds + 1):
-        key = bytes(keep.tolist()) + bytes([fewer])
+        key = bytes(keep.tolist()) + bytes([fewer, by_shares])
         if key not in known:
             rest = replace(model, gaussians=model.gaussians[keep])
             shares, where_highest, score = unseen_shares(rest, views)
-            plain = rest.without_camera
-            weights = [blend_weights(plain, of) / len(of) for of in (views, scene.train)]
-            known[key] = shares, where_highest, *weights, unseen_shares(rest, scene.train)[0], score
-        shares, where_highest, there, here, told, score = known[key]
+            if by_shares:
+                there, here = shares, unseen_shares(rest, scene.train)[0]
+            else:
+                there, here = (blend_weights(rest.without_camera, of) / len(of) for of in (views, scene.train))
+            known[key] = shares, where_highest, there, here, score
+        shares, where_highest, there, here, score = known[key]
         scores.append(score)
-        if by_shares:
-            there, here = shares, told
         hang = hanging(shares, there, here, ratio=ratio, together=together, alone=alone)
         if most is not None:
             held = torch.where(hang, shares, 0.0)

@@ -63,7 +63,7 @@ __all__ = [
 
 Row = dict[str, Any]
 """``scene``, ``candidate`` and ``seed``, ``held-out`` PSNR if there are such views, ``shared`` PSNR, of their pixels
-that two training photographs show, ``test`` figures, ``gaussians``; of the recipe from other starts the PSNR that is
+that two training photographs show, ``test`` figures, ``gaussians``; of the recipe from the dense start the PSNR
 ``expected`` of views that nobody took."""
 
 _SECOND: dict[str, tuple[str, Any]] = {
@@ -256,9 +256,8 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
             (on_white(model.test_rendering(v).image.clamp(0, 1), v.mask), on_white(v.image, v.mask)) for v in scene.test
         ]
         test["lpips"], metric = fmean(perceptual(*pair) for pair in shown), perceptual.name
-    if row["candidate"] == LATER and row["scene"] != name:  # of the study of failures
-        maps = ErrorMaps(model, scene.train)
-        row["expected"] = [round(maps(view).psnr, 3) for view in unseen_views(scene)]
+    if (row["scene"], row["candidate"]) == (from_dense(name), LATER):  # of the study of failures
+        row["expected"] = [round(of.psnr, 3) for of in map(ErrorMaps(model, scene.train), unseen_views(scene))]
     row |= {"test": {x: test[x] for x in _FIGURES if x in test}, "gaussians": results["gaussians"],
             "seconds": results["processor_seconds"], "lpips": metric,
             "cpu": results["machine"]["cpu"]}  # fmt: skip
