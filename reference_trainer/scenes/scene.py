@@ -46,6 +46,12 @@ class View(Viewpoint):
     exposure: Tensor | None = None
     """By how much the photograph was brighter than the scene's others, shape (3,), if `image` was divided by it."""
 
+    def over(self, background: Tensor, before: Tensor) -> View:
+        """Return the view over another background than the one ``before``, both (3,), where it is transparent."""
+        if self.alpha is None or background is before:
+            return self
+        return replace(self, image=self.image + (1 - self.alpha) * (background - before)[:, None, None])
+
     def as_taken(self, image: Tensor) -> Tensor:
         """Return the image (3, H, W), or a render of this view, with the photograph's own exposure."""
         return image if self.exposure is None else image * self.exposure[:, None, None]

@@ -51,7 +51,8 @@ class TrainConfig:
     models: int = 1
     """Models that are trained side by side and compared with each other, 2 for CoR-GS and SE-GS; the first is kept."""
     random_background: bool = False
-    """Train over a background color drawn anew at each step, which penalizes transparency (CoR-GS, SE-GS)."""
+    """Train over a background color drawn anew at each step, which penalizes transparency (CoR-GS, SE-GS); photographs
+    with an alpha channel lie over it, too, so that what is empty stays empty."""
     renderer: str = "builtin"
     """Renderer of the training: "builtin", this package's own, "gsplat", which needs gsplat and a CUDA device, or
     "my_module:MyRenderer"."""

@@ -51,11 +51,12 @@ class Step:
 
     Args:
         number: of the step, the first being 0.
-        view: the training view, on the model's device.
+        view: the training view, on the model's device, over the background of this step.
         views: all training views.
         gaussians: the model.
         regularizer: the regularizers that act in this step; an empty chain if none do.
         background: color behind the model, shape (3,).
+        photographed_over: color behind ``views``, which may be another one; None for the same.
         sh_degree: highest band of spherical harmonics of this step.
         seed: of the training.
         renderer: what renders.
@@ -82,6 +83,7 @@ class Step:
     sh_degree: int
     seed: int
     renderer: Callable[..., Any]
+    photographed_over: Tensor | None = None
     absgrad: bool = False
     label: str = ""
     siblings: Sequence[Step] = ()
@@ -123,6 +125,8 @@ class Step:
         """
         # A shallow copy: `observed` is one list, so density control sees the renders of both.
         other = copy(self)
+        if self.photographed_over is not None:
+            view = view.over(self.background, self.photographed_over)
         other.view, other.params = view, self.gaussians.params(view.camera, step=self.number)
         other.label += f"{view.name}/"
         if self.rendering is None:

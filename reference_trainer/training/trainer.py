@@ -55,8 +55,8 @@ class Trainer:
         removed: of the first model, as it was before, what the guard removed after the last step; None if nothing.
 
     Raises:
-        ValueError: if the photographs lack what a term of the loss compares with, or show a background where it is to
-            be random, or the training is to be analytic and a regularizer has no exact expectation.
+        ValueError: if the photographs lack what a term of the loss compares with, or the training is to be analytic
+            and a regularizer has no exact expectation.
         ImportError: if gsplat is to render, and is missing.
         RuntimeError: if gsplat is to render on something else than a CUDA device.
 
@@ -94,8 +94,6 @@ class Trainer:
         self.losses = make_losses(config)
         for term in self.losses:
             term.begin(scene)
-        if config.random_background and any(view.alpha is not None for view in scene.train):
-            raise ValueError(f"the photographs of {scene.name!r} lie on a background already: leave random_background.")
         if config.analytic:
             self._refuse_draws_without_multiplier()
         if config.guard and not config.regularizers:
@@ -305,7 +303,7 @@ class Trainer:
         if self.config.random_background:
             generator = stream(self.config.seed, self.step, "background", self.device)
             background = torch.rand(3, generator=generator, device=self.device)
-        view = self.views[view_order(self.config.seed, self.step, len(self.views))]
+        view = self.views[view_order(self.config.seed, self.step, len(self.views))].over(background, self.background)
         for model in self.models:
             step = Step(
                 self.step,
@@ -317,6 +315,7 @@ class Trainer:
                 sh_degree=self.config.sh_degree_at(self.step + 1),
                 seed=self.config.seed,
                 renderer=self.renderer,
+                photographed_over=self.background,
                 absgrad="absgrad" in self.density.needs and self.density.observes(self.step),
                 label=model.label,
                 siblings=steps,

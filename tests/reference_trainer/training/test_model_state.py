@@ -204,9 +204,30 @@ def test_all_models_train_over_one_random_background(tiny_scene):
         trainer.train_step()
     assert len({tuple(color.tolist()) for color in colors}) == 3
     assert torch.equal(model_of(trainer).background, tiny_scene.background)
-    views = tuple(dataclasses.replace(view, alpha=torch.ones(24, 32)) for view in tiny_scene.train)
-    with pytest.raises(ValueError, match="a background already"):
-        Trainer(dataclasses.replace(tiny_scene, train=views), trainer.config)
+
+
+def test_photographs_with_an_alpha_channel_lie_over_the_random_background_too(tiny_scene):
+    """Those of the step and those that a term asks for, made anew from what is in front."""
+
+    def over(color, front, alpha):
+        return front * alpha + (1 - alpha) * color[:, None, None]
+
+    g = torch.Generator().manual_seed(0)
+    fronts = {view.name: (view.image, torch.rand(24, 32, generator=g)) for view in tiny_scene.train}
+    white = torch.ones(3)
+    views = tuple(
+        dataclasses.replace(view, image=over(white, *fronts[view.name]), alpha=fronts[view.name][1])
+        for view in tiny_scene.train
+    )
+    scene = dataclasses.replace(tiny_scene, train=views, background=white)
+    trainer = Trainer(scene, TrainConfig(iterations=3, random_background=True))
+    (step,) = trainer.begin_steps()
+    step.sample(depth=False)
+    for view in (step.view, step.at(trainer.views[0]).view, step.at(trainer.views[1]).view):
+        torch.testing.assert_close(view.image, over(step.background, *fronts[view.name]))
+    assert not step.background.equal(white)
+    for name, (front, alpha) in fronts.items():  # what was photographed stays
+        assert next(view for view in trainer.views if view.name == name).image.equal(over(white, front, alpha))
 
 
 @pytest.mark.parametrize("models", [1, 2])
