@@ -67,6 +67,8 @@ def alpha_masks(scene: Scene, config: TrainConfig) -> PlanItem:
     losses = make_losses(config)
     if any(isinstance(term, Alpha) and term.dark is None for term in losses):
         return PlanItem("alpha masks", "used", "asked for: Alpha compares with them")
+    if config.random_background:
+        return PlanItem("alpha masks", "used", "asked for (random_background): the pictures lie over it")
     if any(isinstance(term, Warp) for term in losses):
         reason = "Warp agrees with fog where pictures are transparent (lego: 20 in place of 24 dB): add alpha to loss"
         return PlanItem("alpha masks", "recommended", reason)
