@@ -73,8 +73,8 @@ class ErrorMap(NamedTuple):
 
     Attributes:
         error: expected absolute error of the color, mean over RGB, colors in [0, 1], shape (H, W).
-        psnr: expected of the view, dB, over the pixels that count; nan if none does. It tells the worst of trainings
-            that differ in their seed, but ranks no settings: a plainly trained model expects too much of itself.
+        psnr: expected of the view, dB, over the pixels that count; nan if none does. It is low
+            where a training failed, but ranks neither good ones nor settings: a plain model expects too much of itself.
         interval: in which the PSNR should lie in 80 % of the cases, dB.
     """
 
