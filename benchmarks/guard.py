@@ -32,10 +32,11 @@ from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.measure import load_run_model
+from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 from reference_trainer.scenes.virtual_cameras import amid_views, unseen_views
 
-__all__ = ["RULES", "by_place", "keeps", "main"]
+__all__ = ["RULES", "by_place", "held_out_views", "keeps", "main"]
 
 RULES: dict[str, dict[str, Any]] = {
     "ratio 2, 0.3 %": {"ratio": 2.0, "alone": 0.003},
@@ -93,7 +94,7 @@ def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
     """Return the rows of a run, "none" being the model as it is."""
     model, scene = load_run_model(run)
     options, config = read_run_settings(run / "config.json")
-    others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(scene.name, ())]
+    others = held_out_views(options, config.seed)
     splits: dict[str, Sequence[View]] = dict(zip(_SPLITS, (others, scene.test, scene.train), strict=True))
     known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, float]] = {}
     rows, of_kept = [], dict[bytes, dict[str, dict[str, float]]]()
@@ -113,6 +114,12 @@ def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
         shown = {split: round(rows[-1][split], 2) for split in _SPLITS}
         print(run.name, name, rows[-1]["removed"], shown, *(f"{1e3 * x:.2f}" for x in scores), flush=True)
     return rows
+
+
+def held_out_views(options: SceneOptions, seed: int) -> list[View]:
+    """Return the held-out views of a scene, without those of another exposure."""
+    others = OTHER_EXPOSURE.get(Path(options.path).name, ())
+    return [view for view in held_out(options, seed).test if view.name not in others]
 
 
 @torch.no_grad()
@@ -175,7 +182,7 @@ def by_place(run: Path, rounds: int = 3) -> str:
     """
     model, scene = load_run_model(run)
     options, config = read_run_settings(run / "config.json")
-    others = [v for v in held_out(options, config.seed).test if v.name not in OTHER_EXPOSURE.get(scene.name, ())]
+    others = held_out_views(options, config.seed)
 
     def figures(keep: Tensor) -> Tensor:
         rest = replace(model, gaussians=model.gaussians[keep])

@@ -21,9 +21,8 @@ import torch
 import tyro
 from torch import Tensor
 
-from benchmarks.guard import OTHER_EXPOSURE, quality
+from benchmarks.guard import held_out_views, quality
 from benchmarks.paper.scenes import SCENES
-from benchmarks.remedy import held_out
 from benchmarks.setting import HELD_OUT
 from benchmarks.start_scenes import SIFT
 from reference_trainer.evaluation.results import write_json
@@ -31,9 +30,10 @@ from reference_trainer.evaluation.shares import guard
 from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
+from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.load import load_scene
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.recipes import with_recipe
 from reference_trainer.training.trainer import Trainer
 
@@ -105,7 +105,6 @@ def main(
             if not any((row["scene"], row["seed"]) == (name, seed) for row in known):
                 row = trained(_options(paths[0], name), name, seed)
                 print(row, flush=True)
-                known = json.loads(out.read_text("utf-8")) if out.exists() else []  # another process may have written
                 write_json(out, [*known, row])
 
 
@@ -120,10 +119,9 @@ def _options(starts: Path, name: str) -> SceneOptions:
 def trained(options: SceneOptions, name: str, seed: int) -> Row:
     """Train once, with both ends of density control, and return the row."""
     scene = load_scene(options, seed=seed)
-    views = {"test": scene.test}
+    views: dict[str, Sequence[View]] = {"test": scene.test}
     if name in HELD_OUT:
-        others = OTHER_EXPOSURE.get(name, ())
-        views["held-out"] = tuple(view for view in held_out(options, seed).test if view.name not in others)
+        views["held-out"] = held_out_views(options, seed)
     config = with_recipe("sparse", seed=seed, guard=0)  # every mean gets a guard of its own
     first, *forks = (Trainer(scene, replace(config, densify_until=until)) for until in UNTIL.values())
     first.train(until=max(until for until in UNTIL.values() if until))
@@ -143,9 +141,8 @@ def trained(options: SceneOptions, name: str, seed: int) -> Row:
 
 def _guarded(trainer: Trainer, gaussians: Gaussians, scene: Scene) -> TrainedModel:
     """Return a model without what hangs where nobody took a photograph, as at the end of a training."""
-    model = TrainedModel(gaussians, trainer.background, trainer.config.regularizers, trainer.step, trainer.sh_degree)
-    keep = guard(model, scene).keep
-    return replace(model, gaussians=gaussians[keep])
+    model = replace(model_of(trainer), gaussians=gaussians)
+    return replace(model, gaussians=gaussians[guard(model, scene).keep])
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -159,8 +156,10 @@ def table(rows: Sequence[Row]) -> str:
     lines = []
     for begin, windows in WINDOWS.items():
         for window in windows:
-            name, gains = f"{begin}{window}", dict[str, dict[str, float]]()
-            for scene in (x for x in SCENES if x in by_scene and name != "1"):
+            if (name := f"{begin}{window}") == "1":
+                continue
+            gains: dict[str, dict[str, float]] = {}
+            for scene in (x for x in SCENES if x in by_scene):
                 gains[scene] = {
                     of: fmean(row[name][of] - row["1"][of] for row in by_scene[scene])
                     for of in SPLITS

@@ -24,10 +24,9 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
-from benchmarks.guard import OTHER_EXPOSURE, quality
+from benchmarks.guard import held_out_views, quality
 from benchmarks.paper.rows import Rows, value
 from benchmarks.paper.scenes import SCENES
-from benchmarks.remedy import held_out
 from benchmarks.start_scenes import SIFT
 from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.lpips import LPIPS, load_lpips
@@ -249,7 +248,7 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
     row: Row = {"scene": _scene(options), "candidate": candidate(config, options), "seed": config.seed}
     compared = row["candidate"].removesuffix(f", {LATER}").removesuffix(RELATIVE) in _REFERENCES
     if (name in HELD_OUT or name.endswith("-many")) and not compared:
-        row["held-out"] = fmean(quality(model, view) for view in _held_out(options, config.seed))
+        row["held-out"] = fmean(quality(model, view) for view in held_out_views(options, config.seed))
     test, metric = results["mean"]["test"], results.get("perceptual_metric")
     if metric is None and perceptual is not None:
         shown = [
@@ -273,16 +272,10 @@ def shared_views(run: Path) -> list[View]:
     model, scene = load_run_model(run)
     options, config = read_run_settings(run / "config.json")
     maps, views = ErrorMaps(model, scene.train), list[View]()
-    for view in _held_out(options, config.seed):
+    for view in held_out_views(options, config.seed):
         seen = (maps.support(view) >= 2).to(view.image)
         views.append(dataclasses.replace(view, mask=seen if view.mask is None else seen * view.mask))
     return views
-
-
-def _held_out(options: SceneOptions, seed: int) -> list[View]:
-    """Return the held-out views of a scene, without those of another exposure."""
-    others = OTHER_EXPOSURE.get(Path(options.path).name, ())
-    return [view for view in held_out(options, seed).test if view.name not in others]
 
 
 def choosing(rows: Sequence[Row]) -> str:
