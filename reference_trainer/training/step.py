@@ -56,7 +56,7 @@ class Step:
         gaussians: the model.
         regularizer: the regularizers that act in this step; an empty chain if none do.
         background: color behind the model, shape (3,).
-        photographed_over: color behind ``views``, which may be another one; None for the same.
+        photographed_over: color behind ``views``.
         sh_degree: highest band of spherical harmonics of this step.
         seed: of the training.
         renderer: what renders.
@@ -80,10 +80,10 @@ class Step:
     regularizer: Chain
     background: Tensor
     _: KW_ONLY
+    photographed_over: Tensor
     sh_degree: int
     seed: int
     renderer: Callable[..., Any]
-    photographed_over: Tensor | None = None
     absgrad: bool = False
     label: str = ""
     siblings: Sequence[Step] = ()
@@ -125,9 +125,8 @@ class Step:
         """
         # A shallow copy: `observed` is one list, so density control sees the renders of both.
         other = copy(self)
-        if self.photographed_over is not None:
-            view = view.over(self.background, self.photographed_over)
-        other.view, other.params = view, self.gaussians.params(view.camera, step=self.number)
+        other.view = view.over(self.background, self.photographed_over)
+        other.params = self.gaussians.params(view.camera, step=self.number)
         other.label += f"{view.name}/"
         if self.rendering is None:
             other.expect()

@@ -51,9 +51,8 @@ def take_step(six, three_views) -> Callable[..., Step]:
     def taken(*, number: int = 5, seed: int = 0, depth: bool = True, regularizer: Chain | None = None, **raw) -> Step:
         chain = Chain() if regularizer is None else regularizer
         gaussians = dataclasses.replace(six, **raw)
-        step = Step(
-            number, three_views[0], three_views, gaussians, chain, BLACK, sh_degree=0, seed=seed, renderer=render
-        )
+        options = {"photographed_over": BLACK, "sh_degree": 0, "seed": seed, "renderer": render}
+        step = Step(number, three_views[0], three_views, gaussians, chain, BLACK, **options)
         step.sample(depth=depth)
         return step
 

@@ -33,7 +33,8 @@ def four() -> tuple[Gaussians, View]:
 
 def step_of(gaussians: Gaussians, view: View, *, seed: int = 0, regularizer: Chain | None = None) -> Step:
     chain = Chain() if regularizer is None else regularizer
-    step = Step(5, view, [view], gaussians, chain, BLACK, sh_degree=0, seed=seed, renderer=render)
+    options = {"photographed_over": BLACK, "sh_degree": 0, "seed": seed, "renderer": render}
+    step = Step(5, view, [view], gaussians, chain, BLACK, **options)
     step.sample(depth=False)
     return step
 
