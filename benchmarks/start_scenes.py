@@ -2,6 +2,7 @@
 
     python -m benchmarks.start_scenes points ../shared/data OUT SCENE...     # OUT/SCENE with a .ply for each start
     python -m benchmarks.start_scenes counts ../shared/data OUT SCENE...     # the same of dense starts of other numbers
+    python -m benchmarks.start_scenes finer ../shared/data OUT SCENE...      # measured on photographs as they are kept
     python -m benchmarks.start_scenes cameras ../shared/data OUT SCENE...    # OUT/SCENE-own
     python -m benchmarks.start_scenes many ../shared/data OUT SCENE...       # OUT/SCENE-many, 14 or 16 photographs
 
@@ -33,7 +34,7 @@ from reference_trainer.scenes.points import colmap_points, filled, random_points
 from reference_trainer.scenes.poses import LARGEST_SIDE, enlarge, find_poses
 from reference_trainer.scenes.scene import PointCloud
 
-__all__ = ["COUNTS", "MANY", "SIFT", "with_counts", "with_many_photographs", "with_own_cameras", "with_points"]
+__all__ = ["COUNTS", "MANY", "SIFT", "with_counts", "with_finer_points", "with_many_photographs", "with_own_cameras", "with_points"]
 
 SIFT = {
     "fern": "sparse_3views/0", "herz-jesu": "sparse_3near/0", "fountain": "sparse_3near/0",
@@ -90,6 +91,21 @@ def with_counts(data: Path, out: Path, name: str) -> None:
         positions, colors = torch.cat([cloud.positions, few.positions]), torch.cat([cloud.colors, few.colors])
         write_points(folder / f"dense_{count}.ply", positions, colors)
         print(f"{name}: {len(positions):,} points")
+
+
+def with_finer_points(data: Path, out: Path, name: str) -> None:
+    """Write the folder of a scene with links to its files, and a dense start of photographs finer than those that train.
+
+    Those that train are made smaller; the start is measured on them as they are in the folder, of fern on `images_8`.
+    """
+    folder = _linked(data / name, out / name)
+    options = replace(SCENES[name].options, path=str(data / name), downscale=1.0)
+    finer = replace(options, images="images_8") if name == "fern" else options
+    few = _few(colmap_points(data / name / SIFT[name]) if name in SIFT else None, torch.Generator().manual_seed(0))
+    began = time.process_time()
+    cloud, about = dense_start(load_scene(finer, trains=False).train, few)
+    write_points(folder / ("finer_and_few.ply" if name in SIFT else "finer.ply"), cloud.positions, cloud.colors)
+    print(f"{name}: {about}; {time.process_time() - began:.0f} s")
 
 
 def _few(sift: PointCloud | None, generator: torch.Generator) -> PointCloud:
@@ -233,7 +249,10 @@ def _placed(model: Any, images: Path) -> list[tuple[str, int, Any]]:
 
 
 if __name__ == "__main__":
-    makers = {"points": with_points, "counts": with_counts, "cameras": with_own_cameras, "many": with_many_photographs}
+    makers = {
+        "points": with_points, "counts": with_counts, "finer": with_finer_points, "cameras": with_own_cameras,
+        "many": with_many_photographs,
+    }  # fmt: skip
     make = makers[sys.argv[1]]
     for scene in sys.argv[4:]:
         make(Path(sys.argv[2]), Path(sys.argv[3]), scene)
