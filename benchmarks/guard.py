@@ -50,6 +50,7 @@ RULES: dict[str, dict[str, Any]] = {
     "ratio 16, 0.3 %, together 5 %": {"ratio": 16.0, "alone": 0.003, "together": 0.05},
     "pilot: 15 twice": {"ratio": 2.0, "alone": 0.0, "most": 15, "rounds": 2},
     "by shares": {"ratio": 64.0, "alone": 0.003, "together": 0.2, "by_shares": True},
+    "by shares, unneeded": {"ratio": 64.0, "alone": 0.003, "together": 0.2, "by_shares": True, "spared": 0.3},
 }
 """The rules of the protocols, and those that were chosen."""
 
@@ -141,11 +142,12 @@ def keeps(
     rounds: int = 3,
     fewer: bool = False,
     by_shares: bool = False,
+    spared: float | None = None,
 ) -> tuple[Tensor, list[float], dict[str, int]]:
     """Return what a rule keeps, the score after each round, and where what went had its highest share.
 
     As `reference_trainer.evaluation.shares.guard`, with the alternatives of the protocol; ``known`` keeps what rules
-    with equal beginnings share.
+    with equal beginnings share. ``spared`` is what the training photographs may lose in the mean, dB.
     """
     views: list[Viewpoint] = unseen_views(scene)
     if fewer:  # of 1/4, 1/2, 3/4 between the middle one, of 1/3, 2/3 and 1 beyond the last two
@@ -169,12 +171,20 @@ def keeps(
             hang &= held >= held.sort(descending=True).values[min(most, len(held)) - 1]
         if number == rounds or not bool(hang.any()):
             break
+        rest = keep.clone()
+        rest[keep] = ~hang
+        if spared is not None:
+            before, after = (
+                fmean(quality(of, view) for view in scene.train)
+                for of in (model, replace(model, gaussians=model.gaussians[rest]))
+            )
+            if before - after > spared:
+                break
         where.update(views[i].name for i in where_highest[hang].tolist())
-        keep[keep.clone()] = ~hang
+        keep = rest
     return keep, scores, dict(where)
 
 
-@torch.no_grad()
 def by_place(run: Path, rounds: int = 3) -> str:
     """Return what changes if each place is judged by itself, amid 3 and 4 neighbors or, of few cameras, on their ways.
 

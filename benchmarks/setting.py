@@ -138,6 +138,7 @@ STARTS = {
     "measured.ply": "measured", "dense_and_measured.ply": "dense and measured",
     "dense_5000.ply": "5,000 dense and few", "dense_8000.ply": "8,000 dense and few",
     "dense_30000.ply": "30,000 dense and few", "dense_filled.ply": "filled",
+    "finer.ply": "finer", "finer_and_few.ply": "finer",
 }  # fmt: skip
 """Values of ``--points`` whose rows stand apart, and what they are called: files of `benchmarks.start_scenes`."""
 REFERENCES = Path(__file__).with_name("data") / "paper"
