@@ -171,20 +171,21 @@ def keeps(
             hang &= held >= held.sort(descending=True).values[min(most, len(held)) - 1]
         if number == rounds or not bool(hang.any()):
             break
-        rest = keep.clone()
-        rest[keep] = ~hang
+        left = keep.clone()
+        left[keep] = ~hang
         if spared is not None:
             before, after = (
                 fmean(quality(of, view) for view in scene.train)
-                for of in (model, replace(model, gaussians=model.gaussians[rest]))
+                for of in (model, replace(model, gaussians=model.gaussians[left]))
             )
             if before - after > spared:
                 break
         where.update(views[i].name for i in where_highest[hang].tolist())
-        keep = rest
+        keep = left
     return keep, scores, dict(where)
 
 
+@torch.no_grad()
 def by_place(run: Path, rounds: int = 3) -> str:
     """Return what changes if each place is judged by itself, amid 3 and 4 neighbors or, of few cameras, on their ways.
 
