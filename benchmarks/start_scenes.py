@@ -104,7 +104,7 @@ def with_finer_points(data: Path, out: Path, name: str) -> None:
     few = _few(colmap_points(data / name / SIFT[name]) if name in SIFT else None, torch.Generator().manual_seed(0))
     began = time.process_time()
     cloud, about = dense_start(load_scene(finer, trains=False).train, few)
-    write_points(folder / ("finer_and_few.ply" if name in SIFT else "finer.ply"), cloud.positions, cloud.colors)
+    write_points(folder / "finer.ply", cloud.positions, cloud.colors)
     print(f"{name}: {about}; {time.process_time() - began:.0f} s")
 
 

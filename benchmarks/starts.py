@@ -15,6 +15,7 @@ from statistics import fmean
 
 import numpy as np
 
+from benchmarks.choices import Choice, gains_of
 from benchmarks.paper.rows import value
 from benchmarks.paper.scenes import SCENES
 from benchmarks.setting import CHOSEN, FEW_AND_RANDOM, LATER, Row, rows_of
@@ -25,6 +26,8 @@ __all__ = ["choice", "judgement", "many", "own_cameras", "tables"]
 
 CHOOSING = ("fern", "herz-jesu", "fountain", "sceaux", "cape", "dtu-scan65")
 """The scenes whose held-out views choose a start."""
+FINER = Choice(("finer",), seeds=range(20), tried=(0, 1, 2), starts=True)
+"""The start that is measured on finer photographs than those that train."""
 FROM = {CHOSEN: "from 150", LATER: "from 1,000"}
 
 
@@ -120,6 +123,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
         judgement(rows, "dense and few"),
         own_cameras(rows),
         many(rows),
+        gains_of(rows, FINER),
     ]
 
 
