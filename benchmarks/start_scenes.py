@@ -34,7 +34,10 @@ from reference_trainer.scenes.points import colmap_points, filled, random_points
 from reference_trainer.scenes.poses import LARGEST_SIDE, enlarge, find_poses
 from reference_trainer.scenes.scene import PointCloud
 
-__all__ = ["COUNTS", "MANY", "SIFT", "with_counts", "with_finer_points", "with_many_photographs", "with_own_cameras", "with_points"]
+__all__ = [
+    "COUNTS", "MANY", "SIFT", "with_counts", "with_finer_points", "with_many_photographs", "with_own_cameras",
+    "with_points",
+]  # fmt: skip
 
 SIFT = {
     "fern": "sparse_3views/0", "herz-jesu": "sparse_3near/0", "fountain": "sparse_3near/0",
@@ -94,7 +97,7 @@ def with_counts(data: Path, out: Path, name: str) -> None:
 
 
 def with_finer_points(data: Path, out: Path, name: str) -> None:
-    """Write the folder of a scene with links to its files, and a dense start of photographs finer than those that train.
+    """Write the folder of a scene with links to its files, and a dense start of photographs that are finer.
 
     Those that train are made smaller; the start is measured on them as they are in the folder, of fern on `images_8`.
     """
