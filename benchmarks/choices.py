@@ -85,6 +85,7 @@ CHOICES = {
     "eleventh": Choice((DISTILLED[2], DISTILLED[3], DISTILLED[1], TWICE), seeds=range(6), tried=(3,)),
     "twelfth": Choice((DISTILLED[2], *OTHER_KINDS), seeds=range(6), tried=(3,)),
     "thirteenth": Choice((HALF, THIRD, DISTILLED[2], OTHER_KINDS[-1], *_SHORTER), seeds=range(6), tried=(3,)),
+    "seventeenth": Choice(("limit 0.2", "limit 0.1"), seeds=range(20)),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""

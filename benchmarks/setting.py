@@ -89,7 +89,6 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "needles, weakly": ("loss", "Needles(0.002,"),
     "limit 0.2": ("density", "LimitedDensity(0.2)"),
     "limit 0.1": ("density", "LimitedDensity(0.1)"),
-    "limit 0.05": ("density", "LimitedDensity(0.05)"),
     "means x4": ("means_rate", 6.4e-4),
     "means x1/4": ("means_rate", 4e-5),
     "means by pixels": ("means_rate", (2.45e-3, 4.7e-4, 5.2e-4, 2.5e-4, 5e-4, 1.67e-4)),
@@ -141,7 +140,7 @@ STARTS = {
     "measured.ply": "measured", "dense_and_measured.ply": "dense and measured",
     "dense_5000.ply": "5,000 dense and few", "dense_8000.ply": "8,000 dense and few",
     "dense_30000.ply": "30,000 dense and few", "dense_filled.ply": "filled",
-    "finer.ply": "finer",
+    "finer.ply": "finer", "farther.ply": "farther",
 }  # fmt: skip
 """Values of ``--points`` whose rows stand apart, and what they are called: files of `benchmarks.start_scenes`."""
 REFERENCES = Path(__file__).with_name("data") / "paper"

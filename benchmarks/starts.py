@@ -18,11 +18,11 @@ import numpy as np
 from benchmarks.choices import Choice, gains_of
 from benchmarks.paper.rows import value
 from benchmarks.paper.scenes import SCENES
-from benchmarks.setting import CHOSEN, FEW_AND_RANDOM, LATER, Row, rows_of
+from benchmarks.setting import BINOCULAR, CHOSEN, FEW_AND_RANDOM, LATER, RELATIVE, Row, from_dense, rows_of
 from benchmarks.start_scenes import MANY, OTHER, SIFT
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
-__all__ = ["choice", "judgement", "many", "own_cameras", "tables"]
+__all__ = ["choice", "farther", "judgement", "many", "own_cameras", "tables"]
 
 CHOOSING = ("fern", "herz-jesu", "fountain", "sceaux", "cape", "dtu-scan65")
 """The scenes whose held-out views choose a start."""
@@ -70,6 +70,26 @@ def judgement(rows: Sequence[Row], start: str) -> str:
     if spreads:
         total.append(f"- standard deviation of seeds now, mean over {len(spreads)} scenes: {fmean(spreads):.2f} dB")
     return "\n".join([markdown_table(lines, [*lines[0]]), "", *total])
+
+
+def farther(rows: Sequence[Row], scene: str = "cape") -> str:
+    """Return the table of the longer sweep: what trainings from its points gain over those from the one before."""
+    lines = []
+    settings = {"recipe": LATER, "plain 3DGS": "plain", BINOCULAR: f"{BINOCULAR}{RELATIVE}"}
+    for title, name in settings.items():
+        before, after = (rows_of(rows, of, name) for of in (from_dense(scene), f"{scene}, farther"))
+        if not (shared := sorted(before.keys() & after.keys())):
+            continue
+        pairs = [[value(of[seed], "test psnr") for seed in shared] for of in (before, after)]
+        lines.append({
+            "setting": title, "seeds": ", ".join(map(str, shared)), "as it was": format_mean_std(pairs[0], decimals=2),
+            "farther": format_mean_std(pairs[1], decimals=2),
+            "gain, by seed": ", ".join(f"{b - a:+.2f}" for a, b in zip(*pairs, strict=True)),
+            "at held-out views": ", ".join(
+                f"{after[seed][key] - before[seed][key]:+.2f}" for seed in shared if (key := "held-out") in after[seed]
+            ) or "-",
+        })  # fmt: skip
+    return markdown_table(lines, [*lines[0]]) if lines else "Nothing was trained from the points of a longer sweep."
 
 
 def own_cameras(rows: Sequence[Row]) -> str:
@@ -124,6 +144,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
         own_cameras(rows),
         many(rows),
         gains_of(rows, FINER),
+        farther(rows),
     ]
 
 

@@ -36,6 +36,7 @@ ENOUGH = 10_000  # measured points, to which none are added unasked
 MOST, MOST_IF_THIN = 10, 16  # photographs to measure on unasked: each takes five seconds of a core
 PIXELS = 200_000  # larger photographs are made smaller: more pixels take longer and add no points
 ENLARGED = 1.4  # and smaller ones larger: the windows, of a fixed number of pixels, then cover finer detail
+NEARER, FARTHER = 0.8, 3.0  # ends of the sweep, by the depths of measured points: what lies behind them may be far
 SPACING, PLANES = 0.7, 192  # pixels of motion from plane to plane, and their largest number
 COARSE = 12_000  # pixels of the photographs that find the range of depth where no points tell it
 SOURCES = 2
@@ -56,6 +57,14 @@ class _Image(NamedTuple):
     colors: Tensor
     camera: Camera
     solid: Tensor
+
+
+class _Range(NamedTuple):
+    """The depths that a sweep goes through, and the one at which source views are chosen."""
+
+    near: float
+    far: float
+    usual: float
 
 
 class _Depths(NamedTuple):
@@ -264,7 +273,7 @@ def _shared(points: Tensor, one: Camera, other: Camera) -> tuple[float, float]:
     return float(seen.float().mean()), math.degrees(float(angle))
 
 
-def _visible(cameras: Sequence[Camera], number: int) -> tuple[float, float] | None:
+def _visible(cameras: Sequence[Camera], number: int) -> _Range | None:
     """Return the range of depths at which a camera shares what it sees with another one, from the cameras alone."""
     camera, good = cameras[number], []
     for other in cameras:
@@ -274,10 +283,10 @@ def _visible(cameras: Sequence[Camera], number: int) -> tuple[float, float] | No
             for depth, points in zip(depths.tolist(), _grid(camera, depths), strict=True):
                 seen, angle = _shared(points, camera, other)
                 good += [depth] * (seen >= OVERLAP and ANGLES[0] <= angle <= ANGLES[1])
-    return (min(good), max(good)) if good else None
+    return _Range(min(good), max(good), math.sqrt(min(good) * max(good))) if good else None
 
 
-def _guided(camera: Camera, guide: PointCloud | None) -> tuple[float, float] | None:
+def _guided(camera: Camera, guide: PointCloud | None) -> _Range | None:
     """Return the range of depths around the points that a camera sees, if they are enough to tell it."""
     if guide is None or len(guide.positions) < GUIDES:
         return None
@@ -286,7 +295,7 @@ def _guided(camera: Camera, guide: PointCloud | None) -> tuple[float, float] | N
     if len(depths) < GUIDES:
         return None
     near, far = depths.quantile(torch.tensor([0.01, 0.99])).tolist()
-    return 0.8 * near, 1.6 * far
+    return _Range(NEARER * near, FARTHER * far, math.sqrt(near * far))
 
 
 def _image(view: View, most: int) -> _Image:
@@ -317,7 +326,7 @@ def _stacked(layers: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32]
     return np.stack(padded), sizes
 
 
-def _depth_maps(images: Sequence[_Image], ranges: Sequence[tuple[float, float] | None]) -> list[_Depths | None]:
+def _depth_maps(images: Sequence[_Image], ranges: Sequence[_Range | None]) -> list[_Depths | None]:
     """Measure the depth of every pixel of every picture that has a range and source views."""
     from reference_trainer.compiled import stereo
     from reference_trainer.compiled.threads import in_threads
@@ -326,14 +335,14 @@ def _depth_maps(images: Sequence[_Image], ranges: Sequence[tuple[float, float] |
     cameras = [image.camera for image in images]
     every = zip(images, ranges, strict=True)
     for number, (image, span) in enumerate(progress_bar(iterable=every, total=len(images), **BAR)):
-        sources = [] if span is None else source_views(cameras, number, math.sqrt(span[0] * span[1]))
+        sources = [] if span is None else source_views(cameras, number, span.usual)
         if span is None or not sources:
             found.append(None)
             continue
         gray, (height, width) = image.gray, image.gray.shape
         grays, sizes = _stacked([images[s].gray for s in sources])
         maps = np.stack([_map(image.camera, cameras[s]) for s in sources])
-        inverses = _planes(image.camera, maps, *span)
+        inverses = _planes(image.camera, maps, span.near, span.far)
         pooled = torch.from_numpy(gray)[None]
         moments = [
             torch.nn.functional.avg_pool2d(x, 2 * r + 1, 1, r, count_include_pad=False)[0].numpy()

@@ -129,6 +129,16 @@ def test_two_small_photographs_do_and_repeat():
     assert torch.equal(first.colors, again.colors)
 
 
+def test_what_lies_far_behind_the_measured_points_is_found_as_well():
+    """The plane is twice as far as all that is known, which is a thing before it that has too little texture."""
+    views = pair()
+    pixels = torch.cartesian_prod(torch.arange(4.0, 64, 7), torch.arange(4.0, 48, 6))
+    near = views[0].camera.lift(pixels, torch.full((len(pixels),), 2.3))
+    cloud = dense_points(views, PointCloud(near, torch.zeros_like(near), "known"), count=1_000)
+    x, _, z = cloud.positions.unbind(1)
+    assert ((5 + 0.2 * x) / z - 1).abs().median() < 0.02
+
+
 def test_what_cannot_be_measured_is_refused_with_the_reason():
     views = pair()
     noise = torch.rand(2, 3, 48, 64, generator=torch.Generator().manual_seed(0))
