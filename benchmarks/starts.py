@@ -7,6 +7,7 @@ Their scenes are made by `benchmarks.start_scenes`.
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 from collections.abc import Sequence
@@ -72,18 +73,17 @@ def judgement(rows: Sequence[Row], start: str) -> str:
     return "\n".join([markdown_table(lines, [*lines[0]]), "", *total])
 
 
-def farther(rows: Sequence[Row], scene: str = "cape") -> str:
+def farther(rows: Sequence[Row]) -> str:
     """Return the table of the longer sweep: what trainings from its points gain over those from the one before."""
-    lines = []
-    settings = {"recipe": LATER, "plain 3DGS": "plain", BINOCULAR: f"{BINOCULAR}{RELATIVE}"}
-    for title, name in settings.items():
+    lines, settings = [], {"recipe": LATER, "plain 3DGS": "plain", BINOCULAR: f"{BINOCULAR}{RELATIVE}"}
+    for scene, (title, name) in itertools.product(CHOOSING[::-1], settings.items()):
         before, after = (rows_of(rows, of, name) for of in (from_dense(scene), f"{scene}, farther"))
         if not (shared := sorted(before.keys() & after.keys())):
             continue
         pairs = [[value(of[seed], "test psnr") for seed in shared] for of in (before, after)]
         lines.append({
-            "setting": title, "seeds": ", ".join(map(str, shared)), "as it was": format_mean_std(pairs[0], decimals=2),
-            "farther": format_mean_std(pairs[1], decimals=2),
+            "scene": scene, "setting": title, "seeds": str(len(shared)),
+            "as it was": format_mean_std(pairs[0], decimals=2), "farther": format_mean_std(pairs[1], decimals=2),
             "gain, by seed": ", ".join(f"{b - a:+.2f}" for a, b in zip(*pairs, strict=True)),
             "at held-out views": ", ".join(
                 f"{after[seed][key] - before[seed][key]:+.2f}" for seed in shared if (key := "held-out") in after[seed]

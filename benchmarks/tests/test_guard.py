@@ -25,6 +25,9 @@ def test_a_run_under_rules(tmp_path, capsys):
     model, scene = load_run_model(run)
     kept = keeps(model, scene, {}, **RULES[chosen])[0]
     assert torch.equal(kept, guard(model, scene).keep)
+    pilot = RULES["pilot: 15 twice"]
+    assert not keeps(model, scene, {}, **pilot)[0].all()
+    assert keeps(model, scene, {}, **pilot, spared=-99.0)[0].all()  # photographs that would have to gain 99 dB
     before = out.read_text()
     capsys.readouterr()
     main("measure", (run,), out, (chosen,))

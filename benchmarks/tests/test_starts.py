@@ -50,6 +50,15 @@ def test_a_judgement_pairs_seeds():
     assert "1 scenes: +2.5 dB; the least: +2.5 dB" in table
 
 
+def test_a_longer_sweep_is_met_by_the_seeds_of_the_one_before():
+    rows = [row("cape, dense and few", "from 1,000", 21.0, 14.0, seed=seed) for seed in (0, 1, 2)]
+    rows += [row("cape, farther", "from 1,000", 22.0 + seed, 14.5, seed=seed) for seed in (1, 2, 3)]
+    rows += [row("cape, farther", "plain", 99.0), row("fern, dense and few", "plain", 99.0)]
+    (line,) = [line for line in starts.farther(rows).splitlines() if line.startswith("| cape")]
+    found = [cell.strip() for cell in line.split("|")[1:-1]]
+    assert found == ["cape", "recipe", "2", "21.00 ± 0.00", "23.50 ± 0.71", "+2.00, +3.00", "+0.50, +0.50"]
+
+
 def test_cameras_of_three_photographs_alone():
     rows = [row("fern-own", "drawn", 19.0), row("fern-own, dense and few", "from 1,000", 21.0)]
     assert cells(starts.own_cameras([*rows, row("sceaux-own", "drawn", 16.0)]), "fern")[1:4] == [

@@ -37,6 +37,7 @@ MOST, MOST_IF_THIN = 10, 16  # photographs to measure on unasked: each takes fiv
 PIXELS = 200_000  # larger photographs are made smaller: more pixels take longer and add no points
 ENLARGED = 1.4  # and smaller ones larger: the windows, of a fixed number of pixels, then cover finer detail
 NEARER, FARTHER = 0.8, 3.0  # ends of the sweep, by the depths of measured points: what lies behind them may be far
+SEARCHED = 1.6  # its far end by the depths of the coarse search, which has looked behind them
 SPACING, PLANES = 0.7, 192  # pixels of motion from plane to plane, and their largest number
 COARSE = 12_000  # pixels of the photographs that find the range of depth where no points tell it
 SOURCES = 2
@@ -60,7 +61,7 @@ class _Image(NamedTuple):
 
 
 class _Range(NamedTuple):
-    """The depths that a sweep goes through, and the one at which source views are chosen."""
+    """The depths that a sweep goes through, and the one at which source views are chosen, amid what is known."""
 
     near: float
     far: float
@@ -162,7 +163,8 @@ def _measure(views: Sequence[View], guide: PointCloud | None, count: int) -> Poi
         found = _agreed(small, _depth_maps(small, [_visible(cameras, i) for i in range(len(cameras))]))
         cloud = None if found is None else PointCloud(found[0], found[1], "")
         ranges = [
-            _guided(camera, cloud) if known is None else known for camera, known in zip(cameras, ranges, strict=True)
+            _guided(camera, cloud, SEARCHED) if known is None else known
+            for camera, known in zip(cameras, ranges, strict=True)
         ]
     agreed = _agreed(images, _depth_maps(images, ranges)) or (torch.empty(0, 3), torch.empty(0, 3), torch.empty(0))
     positions, colors, confidence = _thinned(*agreed, cameras, count)
@@ -286,7 +288,7 @@ def _visible(cameras: Sequence[Camera], number: int) -> _Range | None:
     return _Range(min(good), max(good), math.sqrt(min(good) * max(good))) if good else None
 
 
-def _guided(camera: Camera, guide: PointCloud | None) -> _Range | None:
+def _guided(camera: Camera, guide: PointCloud | None, farther: float = FARTHER) -> _Range | None:
     """Return the range of depths around the points that a camera sees, if they are enough to tell it."""
     if guide is None or len(guide.positions) < GUIDES:
         return None
@@ -295,7 +297,7 @@ def _guided(camera: Camera, guide: PointCloud | None) -> _Range | None:
     if len(depths) < GUIDES:
         return None
     near, far = depths.quantile(torch.tensor([0.01, 0.99])).tolist()
-    return _Range(NEARER * near, FARTHER * far, math.sqrt(near * far))
+    return _Range(NEARER * near, farther * far, math.sqrt(NEARER * near * SEARCHED * far))
 
 
 def _image(view: View, most: int) -> _Image:
