@@ -289,7 +289,11 @@ def _visible(cameras: Sequence[Camera], number: int) -> _Range | None:
 
 
 def _guided(camera: Camera, guide: PointCloud | None, farther: float = FARTHER) -> _Range | None:
-    """Return the range of depths around the points that a camera sees, if they are enough to tell it."""
+    """Return the range of depths around the points that a camera sees, if they are enough to tell it.
+
+    It ends at so many times the farthest depth. Source views are chosen for what is known to be there, however far the
+    sweep goes: at the middle of a long one, photographs of a near thing share nothing.
+    """
     if guide is None or len(guide.positions) < GUIDES:
         return None
     pixels, depths = camera.project(guide.positions)
