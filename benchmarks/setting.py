@@ -107,6 +107,8 @@ DENSE = "from 1,000, dense start"
 """The same as a user has it, with the start that it has by default."""
 ONE_EXPOSURE = "one exposure"
 """What the tenth choice adds: photographs made equally bright, ``--one-exposure``."""
+MEAN_BACKGROUND = "mean background"
+"""What the eighteenth choice adds, ``--background mean``."""
 DISTILLED = {1: "distilled, alone", 2: "distilled of two", 3: "distilled of three"}
 """What the eleventh choice adds, by the number of models."""
 TWICE, HALF, THIRD = "twice the steps", "half the steps", "a third of the steps"
@@ -213,6 +215,8 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
     """
     if options is not None and options.one_exposure:
         return f"{candidate(config)} + {ONE_EXPOSURE}"
+    if options is not None and options.background == "mean":
+        return f"{candidate(config)} + {MEAN_BACKGROUND}"
     if "distillation(" in config.loss:
         return f"{LATER if config.dropout else 'plain'} + {_distilled(config.loss)}"
     begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
