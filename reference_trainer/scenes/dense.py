@@ -61,7 +61,7 @@ class _Image(NamedTuple):
 
 
 class _Range(NamedTuple):
-    """The depths that a sweep goes through, and the one at which source views are chosen, amid what is known."""
+    """The depths that a sweep goes through, and the one at which source views are chosen."""
 
     near: float
     far: float
@@ -291,8 +291,8 @@ def _visible(cameras: Sequence[Camera], number: int) -> _Range | None:
 def _guided(camera: Camera, guide: PointCloud | None, farther: float = FARTHER) -> _Range | None:
     """Return the range of depths around the points that a camera sees, if they are enough to tell it.
 
-    It ends at so many times the farthest depth. Source views are chosen for what is known to be there, however far the
-    sweep goes: at the middle of a long one, photographs of a near thing share nothing.
+    It ends at so many times the farthest depth. Source views are chosen at the median depth, however far the sweep
+    goes: at the middle of a long one, photographs of a near thing share nothing.
     """
     if guide is None or len(guide.positions) < GUIDES:
         return None
@@ -300,8 +300,8 @@ def _guided(camera: Camera, guide: PointCloud | None, farther: float = FARTHER) 
     depths = depths[camera.inside(pixels, depths)]
     if len(depths) < GUIDES:
         return None
-    near, far = depths.quantile(torch.tensor([0.01, 0.99])).tolist()
-    return _Range(NEARER * near, farther * far, math.sqrt(NEARER * near * SEARCHED * far))
+    near, usual, far = depths.quantile(torch.tensor([0.01, 0.5, 0.99])).tolist()
+    return _Range(NEARER * near, farther * far, usual)
 
 
 def _image(view: View, most: int) -> _Image:

@@ -139,6 +139,17 @@ def test_what_lies_far_behind_the_measured_points_is_found_as_well():
     assert ((5 + 0.2 * x) / z - 1).abs().median() < 0.02
 
 
+def test_photographs_are_matched_by_how_differently_they_see_what_is_known_and_not_what_is_behind():
+    """Half of the known points is seen from directions 64 degrees apart, which is too much; the middle of the sweep,
+    which the farther ones stretch, from 6 degrees apart."""
+    views = pair()
+    depths = torch.tensor([0.4, 0.4, 0.4, 40.0]).repeat(20)
+    middle = torch.tensor([32.0, 24.0]).expand(len(depths), 2)
+    known = torch.cat([view.camera.lift(middle, depths) for view in views])
+    with pytest.raises(ValueError, match="only 0 points"):
+        dense_points(views, PointCloud(known, torch.zeros_like(known), "known"), count=600)
+
+
 def test_what_cannot_be_measured_is_refused_with_the_reason():
     views = pair()
     noise = torch.rand(2, 3, 48, 64, generator=torch.Generator().manual_seed(0))
