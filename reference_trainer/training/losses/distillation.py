@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -20,7 +18,7 @@ from reference_trainer.training.step import Step
 __all__ = ["Distillation"]
 
 _KEPT = 32
-"""Targets that are not rendered again: three photographs have 27 cameras, half a megapixel takes 6 MB."""
+"""Targets that are not rendered again: three photographs have 27 cameras, half a megapixel takes 8 MB."""
 
 
 class Distillation(WeightedTerm):
@@ -57,8 +55,7 @@ class Distillation(WeightedTerm):
         check_lambda(lambda_dssim)
         self.members, self.lambda_dssim = members, lambda_dssim
         self._models: list[TrainedModel] = []  # read when first asked for
-        self._targets: dict[int, Tensor] = {}  # by the number of the camera, all over one background
-        self._over: Tensor | None = None
+        self._shown: dict[int, Tensor] = {}  # colors over black, and what they let through, by the number of the camera
 
     def begin(self, scene: Scene) -> None:
         """Choose the cameras; raises a ValueError if there is no member, or fewer than two training views."""
@@ -69,7 +66,7 @@ class Distillation(WeightedTerm):
     def value(self, step: Step) -> Tensor:
         """Compare the model with the mean of the members at one camera."""
         device = step.image.device
-        self._models = self._models or [_member(path, step.background) for path in self.members]
+        self._models = self._models or [_member(path, torch.zeros_like(step.background)) for path in self.members]
         generator = step.generator("distillation")
         number = int(torch.randint(len(self.views), (), generator=generator, device=device))
         view = self.views[number].to(device)
@@ -80,19 +77,17 @@ class Distillation(WeightedTerm):
     @torch.no_grad()
     def _target(self, number: int, view: Viewpoint, background: Tensor) -> Tensor:
         """Return the mean of what the members show at a camera."""
-        if background is not self._over:  # of random ones every step has its own
-            self._over, self._targets = background, {}
-        if number in self._targets:
-            return self._targets[number]
-        shown = [replace(each, background=background).test_rendering(view).image for each in self._models]
-        target = torch.stack(shown).mean(dim=0).clamp(0, 1)
-        if len(self._targets) < _KEPT:
-            self._targets[number] = target
-        return target
+        shown = self._shown.get(number)
+        if shown is None:
+            of_all = [each.test_rendering(view) for each in self._models]
+            shown = torch.stack([torch.cat([each.image, 1 - each.alpha[None]]) for each in of_all]).mean(dim=0)
+            if len(self._shown) < _KEPT:
+                self._shown[number] = shown
+        return (shown[:3] + shown[3] * background[:, None, None]).clamp(0, 1)
 
 
-def _member(path: str, background: Tensor) -> TrainedModel:
-    """Return a model as it is rendered at test time."""
+def _member(path: str, black: Tensor) -> TrainedModel:
+    """Return a model as it is rendered at test time, over black."""
     model = load_ply(path)
     scaled = model.for_rendering or model.opacity_scale != 1
     if not scaled:
@@ -100,5 +95,5 @@ def _member(path: str, background: Tensor) -> TrainedModel:
             parse(model.regularizer, imports=False)
         except ValueError as error:
             raise ValueError(f"{path} does not say how it is rendered: {error} Give its PLY for viewers.") from error
-    gaussians = model.gaussians.map(lambda x: x.to(background))
-    return TrainedModel(gaussians, background, model.regularizer, model.step, for_rendering=scaled)
+    gaussians = model.gaussians.map(lambda x: x.to(black))
+    return TrainedModel(gaussians, black, model.regularizer, model.step, for_rendering=scaled)
