@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -22,6 +22,7 @@ from benchmarks.setting import (
     HALF,
     HELD_OUT,
     LATER,
+    MEAN_BACKGROUND,
     ONE_EXPOSURE,
     OTHER_KINDS,
     REFERENCES,
@@ -29,10 +30,10 @@ from benchmarks.setting import (
     THIRD,
     TWICE,
     Row,
-    from_dense,
     references_of,
     rows_of,
 )
+from benchmarks.start_scenes import SIFT, from_dense, from_today
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
@@ -51,6 +52,7 @@ class Choice:
         tried: the candidates' seeds.
         figure: whether all pixels of the held-out views count, or the shared ones.
         starts: whether the names are of points.
+        begun: the start of all, if it is not that of the pages' first choices, of scenes with measured points.
     """
 
     names: tuple[str, ...]
@@ -58,6 +60,7 @@ class Choice:
     tried: tuple[int, ...] = (0,)
     figure: Literal["held-out", "shared"] = "held-out"
     starts: bool = False
+    begun: str = ""
 
 
 _HIDDEN = "warp + hidden left out"
@@ -69,6 +72,7 @@ _SHORTER = (
     f"{DISTILLED[2]}, {HALF}", f"{DISTILLED[3]}, {THIRD}", f"distilled with {HALF}",
     f"distilled with means x1/4 + {HALF}, {_HIDDEN} + {HALF}",
 )  # fmt: skip
+_OVER_MEAN = (MEAN_BACKGROUND, f"random background + {MEAN_BACKGROUND}")
 _COUNTS = ("5,000 dense and few", "8,000 dense and few", "30,000 dense and few", "filled")
 CHOICES = {
     "third": Choice(("rate 0.3", "no reset", "threshold 3e-4"), seeds=(0,)),
@@ -86,6 +90,8 @@ CHOICES = {
     "twelfth": Choice((DISTILLED[2], *OTHER_KINDS), seeds=range(6), tried=(3,)),
     "thirteenth": Choice((HALF, THIRD, DISTILLED[2], OTHER_KINDS[-1], *_SHORTER), seeds=range(6), tried=(3,)),
     "seventeenth": Choice(("limit 0.2", "limit 0.1"), seeds=range(20)),
+    "eighteenth": Choice(_OVER_MEAN, seeds=range(3), begun="farther"),
+    "eighteenth, second round": Choice(_OVER_MEAN, seeds=range(3), tried=(0, 1, 2), begun="farther"),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
@@ -94,7 +100,7 @@ SHARPER = {LATER: "recipe", f"{LATER} + {_SHAPES[1]}": _SHAPES[1]}
 BESIDE_DROPOUT = {"dropout": "dropout alone", LATER: "recipe"}
 """The recipe beside dropout alone, from the start that a user has."""
 BY_DEFAULT = {"plain": "plain", LATER: "recipe"}
-"""What the recipe gains from the start that a user has, for `from_same_start`."""
+"""What the recipe gains from the start that a user has: from the dense start as it was, and as it is now."""
 
 ENSEMBLE = {"plain": "plain", f"{LATER} + {DISTILLED[2]}": DISTILLED[2]}
 """The judgement of the eleventh choice: the seed is that of the first of two models."""
@@ -121,7 +127,8 @@ _JUDGED = (
 def tables(rows: Sequence[Row]) -> list[str]:
     """Return all tables of the later choices."""
     gained = [gains_of(rows, choice) for choice in CHOICES.values()]
-    return [*gained, *(from_same_start(rows, titles) for titles in _JUDGED)]
+    today = from_same_start(rows, BY_DEFAULT, from_today)
+    return [*gained, *(from_same_start(rows, titles) for titles in _JUDGED), today]
 
 
 def gains_of(rows: Sequence[Row], choice: Choice) -> str:
@@ -130,8 +137,9 @@ def gains_of(rows: Sequence[Row], choice: Choice) -> str:
     for name in choice.names:
         line, gains = {"candidate": name}, list[tuple[float, float]]()
         for scene in HELD_OUT:
-            own = (f"{scene}, {name}", LATER) if choice.starts else (from_dense(scene), f"{LATER} + {name}")
-            recipe, found = rows_of(rows, from_dense(scene), LATER), rows_of(rows, *own)
+            start = f"{scene}, {choice.begun}" if choice.begun and scene in SIFT else from_dense(scene)
+            own = (f"{scene}, {name}", LATER) if choice.starts else (start, f"{LATER} + {name}")
+            recipe, found = rows_of(rows, start, LATER), rows_of(rows, *own)
             before, after = (
                 [(of[s][figure], value(of[s], "test psnr"), of[s]["gaussians"]) for s in who if figure in of.get(s, ())]
                 for of, who in ((recipe, choice.seeds), (found, choice.tried))
@@ -147,11 +155,16 @@ def gains_of(rows: Sequence[Row], choice: Choice) -> str:
     return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 
 
-def pairs_of(rows: Sequence[Row], names: Collection[str]) -> dict[str, list[tuple[float, float]]]:
-    """Return test PSNR of two settings with the dense start, by scene, of the seeds that both have."""
+def pairs_of(
+    rows: Sequence[Row], names: Collection[str], begun: Callable[[str], str] = from_dense
+) -> dict[str, list[tuple[float, float]]]:
+    """Return test PSNR of two settings with the dense start, by scene, of the seeds that both have.
+
+    ``begun`` names a scene with its start.
+    """
     found: dict[str, list[tuple[float, float]]] = {}
     for scene in SCENES:
-        start = scene if scene == "synthetic" else from_dense(scene)  # which has points of its own
+        start = scene if scene == "synthetic" else begun(scene)  # which has points of its own
         before, after = (rows_of(rows, start, name) for name in names)
         if start == scene and "plain" in names:
             before = references_of(rows, REFERENCES, scene)["plain"]
@@ -160,18 +173,20 @@ def pairs_of(rows: Sequence[Row], names: Collection[str]) -> dict[str, list[tupl
     return found
 
 
-def from_same_start(rows: Sequence[Row], titles: Mapping[str, str]) -> str:
+def from_same_start(rows: Sequence[Row], titles: Mapping[str, str], begun: Callable[[str], str] = from_dense) -> str:
     """Return a table of two settings with the dense start: test PSNR of the seeds that both have, and the gains.
 
     Args:
         rows: all of them.
         titles: of both, by the names of their rows.
+        begun: names a scene with its start.
     """
-    lines, every, spreads = [], list[float](), list[float]()
-    for scene, pairs in pairs_of(rows, titles.keys()).items():
+    lines, every, means, spreads = [], list[float](), list[float](), list[float]()
+    for scene, pairs in pairs_of(rows, titles.keys(), begun).items():
         figures = [*zip(*pairs, strict=True)]
         gains = [after - before for before, after in pairs]
         every += gains
+        means.append(fmean(gains))
         spreads += [mean_std(figures[1])[1]] if len(pairs) > 1 else []
         line = {"scene": scene, "seeds": str(len(pairs))}
         line |= {title: format_mean_std(of, decimals=2) for title, of in zip(titles.values(), figures, strict=True)}
@@ -180,6 +195,7 @@ def from_same_start(rows: Sequence[Row], titles: Mapping[str, str]) -> str:
         return "Nothing was trained with both."
     total = [
         f"- mean gain over {len(every)} pairs of {len(lines)} scenes: {fmean(every):+.2f} dB",
+        f"- mean of the scenes' gains: {fmean(means):+.2f} dB",
         f"- worst pair: {min(every):+.2f} dB",
     ]
     if spreads:

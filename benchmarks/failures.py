@@ -16,7 +16,8 @@ import numpy as np
 from scipy.stats import binomtest, spearmanr
 
 from benchmarks.paper.rows import value
-from benchmarks.setting import CHOSEN, DENSE, FEWEST, LATER, REFERENCES, Row, from_dense, references_of, rows_of
+from benchmarks.setting import CHOSEN, DENSE, FEWEST, LATER, REFERENCES, Row, references_of, rows_of
+from benchmarks.start_scenes import from_dense
 from reference_trainer.evaluation.tables import markdown_table, mean_std
 
 __all__ = ["FAILING", "failures", "foreseen", "predicted"]

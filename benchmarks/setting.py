@@ -27,7 +27,7 @@ import tyro
 from benchmarks.guard import held_out_views, quality
 from benchmarks.paper.rows import Rows, value
 from benchmarks.paper.scenes import SCENES
-from benchmarks.start_scenes import SIFT
+from benchmarks.start_scenes import FEW_AND_RANDOM, STARTS, from_dense
 from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.lpips import LPIPS, load_lpips
 from reference_trainer.evaluation.metrics import on_white
@@ -47,7 +47,6 @@ __all__ = [
     "choosing",
     "controls",
     "differences",
-    "from_dense",
     "judging",
     "main",
     "measured",
@@ -108,7 +107,7 @@ DENSE = "from 1,000, dense start"
 ONE_EXPOSURE = "one exposure"
 """What the tenth choice adds: photographs made equally bright, ``--one-exposure``."""
 MEAN_BACKGROUND = "mean background"
-"""What the eighteenth choice adds, ``--background mean``."""
+"""What the eighteenth choice tried; its code was not kept."""
 DISTILLED = {1: "distilled, alone", 2: "distilled of two", 3: "distilled of three"}
 """What the eleventh choice adds, by the number of models."""
 TWICE, HALF, THIRD = "twice the steps", "half the steps", "a third of the steps"
@@ -134,17 +133,6 @@ FEWEST = 3
 """From so many seeds on, a setting stands in the table of failures."""
 HELD_OUT = tuple(scene for scene in SCENES if scene not in ("lego", "dtu-scan24"))
 """The scenes whose held-out views choose."""
-FEW_AND_RANDOM = "few measured points, random added"
-STARTS = {
-    "random": "random points", "few_and_random.ply": FEW_AND_RANDOM, "dense.ply": "dense",
-    "dense_and_few.ply": "dense and few", "dense_and_random.ply": "dense, few and random", "sift.ply": "SIFT",
-    "dense_and_sift.ply": "dense and SIFT", "dense_and_other.ply": "dense and other",
-    "measured.ply": "measured", "dense_and_measured.ply": "dense and measured",
-    "dense_5000.ply": "5,000 dense and few", "dense_8000.ply": "8,000 dense and few",
-    "dense_30000.ply": "30,000 dense and few", "dense_filled.ply": "filled",
-    "finer.ply": "finer", "farther.ply": "farther",
-}  # fmt: skip
-"""Values of ``--points`` whose rows stand apart, and what they are called: files of `benchmarks.start_scenes`."""
 REFERENCES = Path(__file__).with_name("data") / "paper"
 """Folder with the rows of the paper's grid."""
 _REFERENCES: dict[str, dict[str, Any]] = {
@@ -215,8 +203,6 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
     """
     if options is not None and options.one_exposure:
         return f"{candidate(config)} + {ONE_EXPOSURE}"
-    if options is not None and options.background == "mean":
-        return f"{candidate(config)} + {MEAN_BACKGROUND}"
     if "distillation(" in config.loss:
         return f"{LATER if config.dropout else 'plain'} + {_distilled(config.loss)}"
     begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
@@ -467,14 +453,13 @@ def _scene(options: SceneOptions) -> str:
     return Path(options.path).name + (f", {start}" if start else "")
 
 
-def from_dense(scene: str) -> str:
-    """Return the name of a scene that begins with a dense start, and with few measured points where there are any."""
-    return f"{scene}, {'dense and few' if scene in SIFT else 'dense'}"
-
-
 def _is_second(candidate: str) -> bool:
     names = set(candidate.split(" + "))
-    return names <= _SECOND.keys() or "distilled" in candidate or bool(names & {ONE_EXPOSURE, *_STEPS.values()})
+    return (
+        names <= _SECOND.keys()
+        or "distilled" in candidate
+        or bool(names & {ONE_EXPOSURE, MEAN_BACKGROUND, *_STEPS.values()})
+    )
 
 
 def rows_of(rows: Sequence[Row], scene: str, name: str) -> dict[int, Row]:

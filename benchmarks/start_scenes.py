@@ -35,8 +35,8 @@ from reference_trainer.scenes.poses import LARGEST_SIDE, enlarge, find_poses
 from reference_trainer.scenes.scene import PointCloud
 
 __all__ = [
-    "COUNTS", "MANY", "SIFT", "with_counts", "with_finer_points", "with_many_photographs", "with_own_cameras",
-    "with_points",
+    "COUNTS", "FEW_AND_RANDOM", "MANY", "SIFT", "STARTS", "from_dense", "from_today", "with_counts",
+    "with_finer_points", "with_many_photographs", "with_own_cameras", "with_points",
 ]  # fmt: skip
 
 SIFT = {
@@ -54,6 +54,36 @@ COUNTS = (5_000, 8_000, 30_000)
 """Points of a dense start, which usually has 15,000."""
 MIN_MATCHES = 20
 """So many points place a photograph."""
+
+
+MEDIAN = ("dtu-scan24", "sceaux")
+"""The scenes whose dense start has changed since source views are chosen at the median depth."""
+FEW_AND_RANDOM = "few measured points, random added"
+STARTS = {
+    "random": "random points", "few_and_random.ply": FEW_AND_RANDOM, "dense.ply": "dense",
+    "dense_and_few.ply": "dense and few", "dense_and_random.ply": "dense, few and random", "sift.ply": "SIFT",
+    "dense_and_sift.ply": "dense and SIFT", "dense_and_other.ply": "dense and other",
+    "measured.ply": "measured", "dense_and_measured.ply": "dense and measured",
+    "dense_5000.ply": "5,000 dense and few", "dense_8000.ply": "8,000 dense and few",
+    "dense_30000.ply": "30,000 dense and few", "dense_filled.ply": "filled",
+    "finer.ply": "finer", "farther.ply": "farther", "median.ply": "median",
+}  # fmt: skip
+"""Values of ``--points`` whose rows stand apart, and what they are called: files of `benchmarks.start_scenes`."""
+
+
+def from_dense(scene: str) -> str:
+    """Return the name of a scene that begins with a dense start, and with few measured points where there are any."""
+    return f"{scene}, {'dense and few' if scene in SIFT else 'dense'}"
+
+
+def from_today(scene: str) -> str:
+    """Return the name of a scene that begins with the dense start as it is now, where that has changed.
+
+    Example:
+        >>> from_today("cape"), from_today("sceaux"), from_today("lego")
+        ('cape, farther', 'sceaux, median', 'lego, dense')
+    """
+    return f"{scene}, median" if scene in MEDIAN else f"{scene}, farther" if scene in SIFT else from_dense(scene)
 
 
 def with_points(data: Path, out: Path, name: str) -> None:

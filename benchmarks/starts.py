@@ -19,8 +19,8 @@ import numpy as np
 from benchmarks.choices import Choice, gains_of
 from benchmarks.paper.rows import value
 from benchmarks.paper.scenes import SCENES
-from benchmarks.setting import BINOCULAR, CHOSEN, FEW_AND_RANDOM, LATER, RELATIVE, Row, from_dense, rows_of
-from benchmarks.start_scenes import MANY, OTHER, SIFT
+from benchmarks.setting import BINOCULAR, CHOSEN, LATER, RELATIVE, Row, rows_of
+from benchmarks.start_scenes import FEW_AND_RANDOM, MANY, OTHER, SIFT, from_dense
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = ["choice", "farther", "judgement", "many", "own_cameras", "tables"]

@@ -82,7 +82,7 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
         start, cloud, about_points = model_start(options.init)
     check_no_leak(cloud, trained, held_out, allow=options.allow_test_points)
     chosen = capture.background if options.background == "auto" else options.background
-    color: Tensor = torch.tensor(BACKGROUNDS.get(chosen, BACKGROUNDS["black"]))
+    color: Tensor = torch.tensor(BACKGROUNDS[chosen])
     downscale, about_size = _downscale([*train, *test], options.downscale)
     load = partial(load_view, background=color, downscale=downscale, undistort=options.undistort)
     views = {"train": tuple(map(load, train)), "test": tuple(map(load, test))}
@@ -97,8 +97,6 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
     if options.one_exposure:
         *of_splits, about_exposure = with_one_exposure(views["train"], views["test"], cloud.positions)
         views = dict(zip(views, of_splits, strict=True))
-    if chosen == "mean":
-        color = _mean_color(views["train"])
     if options.depth == "points":
         views["train"] = tuple(point_prior(view, cloud) for view in views["train"])
     elif options.depth is not None:
@@ -120,13 +118,6 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
         source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
         notes=tuple(filter(None, (about_unread, about_size, about_lenses, about_masks, about_points, about_exposure))),
     )
-
-
-def _mean_color(views: Sequence[View]) -> Tensor:
-    """Return the mean color (3,) of photographs, which are to be opaque."""
-    if any(view.alpha is not None for view in views):
-        raise ValueError("background mean is for photographs without an alpha channel, these have one: use black or white.")
-    return torch.cat([view.image.flatten(1) for view in views], 1).double().mean(1).float()
 
 
 def _enough_points(

@@ -60,8 +60,7 @@ class SceneOptions:
     downscale: float | None = None
     """Make pictures smaller by this factor; by default those above half a megapixel are reduced to that."""
     background: str = "auto"
-    """"black" or "white" behind transparent pictures, or "mean", the mean color of opaque training photographs, which
-    shows where none of them looked; "auto" is white for Blender scenes, else black."""
+    """"black" or "white" behind transparent pictures; "auto" is white for Blender scenes, else black."""
     one_exposure: bool = False
     """Make photographs of different exposure or white balance equally bright, by the points that they share; nothing
     where they do not differ. Test views are compared at the exposure that the training cameras suggest."""
@@ -73,8 +72,8 @@ class SceneOptions:
     def __post_init__(self) -> None:
         if self.downscale is not None and not 1 <= self.downscale < math.inf:
             raise ValueError(f"downscale must be a finite number of at least 1, got {self.downscale}.")
-        if self.background not in ("auto", "mean", *BACKGROUNDS):
-            raise ValueError(f"background must be auto, mean, {' or '.join(BACKGROUNDS)}, got {self.background!r}.")
+        if self.background not in ("auto", *BACKGROUNDS):
+            raise ValueError(f"background must be auto, {' or '.join(BACKGROUNDS)}, got {self.background!r}.")
         if self.views is not None and self.views < 1:
             raise ValueError(f"views must be at least 1, got {self.views}.")
         if self.test not in ("auto", "none"):
