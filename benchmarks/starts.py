@@ -23,7 +23,7 @@ from benchmarks.setting import BINOCULAR, CHOSEN, LATER, RELATIVE, Row, rows_of
 from benchmarks.start_scenes import FEW_AND_RANDOM, MANY, OTHER, SIFT, from_dense
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
-__all__ = ["choice", "farther", "judgement", "many", "own_cameras", "tables"]
+__all__ = ["changed", "choice", "judgement", "many", "own_cameras", "tables"]
 
 CHOOSING = ("fern", "herz-jesu", "fountain", "sceaux", "cape", "dtu-scan65")
 """The scenes whose held-out views choose a start."""
@@ -73,23 +73,24 @@ def judgement(rows: Sequence[Row], start: str) -> str:
     return "\n".join([markdown_table(lines, [*lines[0]]), "", *total])
 
 
-def farther(rows: Sequence[Row]) -> str:
-    """Return the table of the longer sweep: what trainings from its points gain over those from the one before."""
+def changed(rows: Sequence[Row], start: str) -> str:
+    """Return the table of a changed dense start: what trainings from it gain over those from the one before."""
     lines, settings = [], {"recipe": LATER, "plain 3DGS": "plain", BINOCULAR: f"{BINOCULAR}{RELATIVE}"}
-    for scene, (title, name) in itertools.product(CHOOSING[::-1], settings.items()):
-        before, after = (rows_of(rows, of, name) for of in (from_dense(scene), f"{scene}, farther"))
+    for scene, (title, name) in itertools.product([*SCENES][::-1], settings.items()):
+        former = f"{scene}, farther" if start == "median" and scene in SIFT else from_dense(scene)
+        before, after = (rows_of(rows, of, name) for of in (former, f"{scene}, {start}"))
         if not (shared := sorted(before.keys() & after.keys())):
             continue
         pairs = [[value(of[seed], "test psnr") for seed in shared] for of in (before, after)]
         lines.append({
             "scene": scene, "setting": title, "seeds": str(len(shared)),
-            "as it was": format_mean_std(pairs[0], decimals=2), "farther": format_mean_std(pairs[1], decimals=2),
+            "as it was": format_mean_std(pairs[0], decimals=2), start: format_mean_std(pairs[1], decimals=2),
             "gain, by seed": ", ".join(f"{b - a:+.2f}" for a, b in zip(*pairs, strict=True)),
             "at held-out views": ", ".join(
                 f"{after[seed][key] - before[seed][key]:+.2f}" for seed in shared if (key := "held-out") in after[seed]
             ) or "-",
         })  # fmt: skip
-    return markdown_table(lines, [*lines[0]]) if lines else "Nothing was trained from the points of a longer sweep."
+    return markdown_table(lines, [*lines[0]]) if lines else f"Nothing was trained from the points {start!r}."
 
 
 def own_cameras(rows: Sequence[Row]) -> str:
@@ -144,7 +145,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
         own_cameras(rows),
         many(rows),
         gains_of(rows, FINER),
-        farther(rows),
+        *(changed(rows, start) for start in ("farther", "median")),
     ]
 
 
