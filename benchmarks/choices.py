@@ -33,7 +33,7 @@ from benchmarks.setting import (
     references_of,
     rows_of,
 )
-from benchmarks.start_scenes import SIFT, from_dense, from_today
+from benchmarks.start_scenes import from_dense, from_today
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
@@ -52,7 +52,7 @@ class Choice:
         tried: the candidates' seeds.
         figure: whether all pixels of the held-out views count, or the shared ones.
         starts: whether the names are of points.
-        begun: the start of all, if it is not that of the pages' first choices, of scenes with measured points.
+        begun: names a scene with the start of all.
     """
 
     names: tuple[str, ...]
@@ -60,7 +60,7 @@ class Choice:
     tried: tuple[int, ...] = (0,)
     figure: Literal["held-out", "shared"] = "held-out"
     starts: bool = False
-    begun: str = ""
+    begun: Callable[[str], str] = from_dense
 
 
 _HIDDEN = "warp + hidden left out"
@@ -73,6 +73,7 @@ _SHORTER = (
     f"distilled with means x1/4 + {HALF}, {_HIDDEN} + {HALF}",
 )  # fmt: skip
 _OVER_MEAN = (MEAN_BACKGROUND, f"random background + {MEAN_BACKGROUND}")
+_BEGINNINGS = ("opaque", "small", "opaque + small", "large")
 _COUNTS = ("5,000 dense and few", "8,000 dense and few", "30,000 dense and few", "filled")
 CHOICES = {
     "third": Choice(("rate 0.3", "no reset", "threshold 3e-4"), seeds=(0,)),
@@ -90,8 +91,10 @@ CHOICES = {
     "twelfth": Choice((DISTILLED[2], *OTHER_KINDS), seeds=range(6), tried=(3,)),
     "thirteenth": Choice((HALF, THIRD, DISTILLED[2], OTHER_KINDS[-1], *_SHORTER), seeds=range(6), tried=(3,)),
     "seventeenth": Choice(("limit 0.2", "limit 0.1"), seeds=range(20)),
-    "eighteenth": Choice(_OVER_MEAN, seeds=range(3), begun="farther"),
-    "eighteenth, second round": Choice(_OVER_MEAN, seeds=range(3), tried=(0, 1, 2), begun="farther"),
+    "eighteenth": Choice(_OVER_MEAN, seeds=range(3), begun=from_today),
+    "eighteenth, second round": Choice(_OVER_MEAN, seeds=range(3), tried=(0, 1, 2), begun=from_today),
+    "nineteenth": Choice(_BEGINNINGS, seeds=range(3), figure="shared", begun=from_today),
+    "nineteenth, second round": Choice(_BEGINNINGS, seeds=range(3), tried=(0, 1, 2), figure="shared", begun=from_today),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
@@ -137,7 +140,7 @@ def gains_of(rows: Sequence[Row], choice: Choice) -> str:
     for name in choice.names:
         line, gains = {"candidate": name}, list[tuple[float, float]]()
         for scene in HELD_OUT:
-            start = f"{scene}, {choice.begun}" if choice.begun and scene in SIFT else from_dense(scene)
+            start = choice.begun(scene)
             own = (f"{scene}, {name}", LATER) if choice.starts else (start, f"{LATER} + {name}")
             recipe, found = rows_of(rows, start, LATER), rows_of(rows, *own)
             before, after = (

@@ -54,10 +54,6 @@ COUNTS = (5_000, 8_000, 30_000)
 """Points of a dense start, which usually has 15,000."""
 MIN_MATCHES = 20
 """So many points place a photograph."""
-
-
-MEDIAN = ("dtu-scan24", "sceaux")
-"""The scenes whose dense start has changed since source views are chosen at the median depth."""
 FEW_AND_RANDOM = "few measured points, random added"
 STARTS = {
     "random": "random points", "few_and_random.ply": FEW_AND_RANDOM, "dense.ply": "dense",
@@ -66,9 +62,10 @@ STARTS = {
     "measured.ply": "measured", "dense_and_measured.ply": "dense and measured",
     "dense_5000.ply": "5,000 dense and few", "dense_8000.ply": "8,000 dense and few",
     "dense_30000.ply": "30,000 dense and few", "dense_filled.ply": "filled",
-    "finer.ply": "finer", "farther.ply": "farther", "median.ply": "median",
+    "finer.ply": "finer", "farther.ply": "farther", "now.ply": "as now",
 }  # fmt: skip
-"""Values of ``--points`` whose rows stand apart, and what they are called: files of `benchmarks.start_scenes`."""
+"""Values of ``--points`` whose rows stand apart, and what they are called: files that are made here, or copies that keep
+what a later program made of the same name."""
 
 
 def from_dense(scene: str) -> str:
@@ -77,13 +74,8 @@ def from_dense(scene: str) -> str:
 
 
 def from_today(scene: str) -> str:
-    """Return the name of a scene that begins with the dense start as it is now, where that has changed.
-
-    Example:
-        >>> from_today("cape"), from_today("sceaux"), from_today("lego")
-        ('cape, farther', 'sceaux, median', 'lego, dense')
-    """
-    return f"{scene}, median" if scene in MEDIAN else f"{scene}, farther" if scene in SIFT else from_dense(scene)
+    """Return the name of a scene that begins with the dense start as it is now, which of lego has not changed."""
+    return from_dense(scene) if scene == "lego" else f"{scene}, as now"
 
 
 def with_points(data: Path, out: Path, name: str) -> None:
