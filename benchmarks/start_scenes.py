@@ -64,8 +64,8 @@ STARTS = {
     "dense_30000.ply": "30,000 dense and few", "dense_filled.ply": "filled",
     "finer.ply": "finer", "farther.ply": "farther", "now.ply": "as now",
 }  # fmt: skip
-"""Values of ``--points`` whose rows stand apart, and what they are called: files that are made here, or copies that keep
-what a later program made of the same name."""
+"""Values of ``--points`` whose rows stand apart, and what they are called: files that are made here, or copies that
+keep what a later program made of the same name."""
 
 
 def from_dense(scene: str) -> str:
