@@ -95,7 +95,7 @@ CHOICES = {
     "eighteenth, second round": Choice(_OVER_MEAN, seeds=range(3), tried=(0, 1, 2), begun=from_today),
     "nineteenth": Choice(_BEGINNINGS, seeds=range(3), figure="shared", begun=from_today),
     "nineteenth, second round": Choice(_BEGINNINGS, seeds=range(3), tried=(0, 1, 2), figure="shared", begun=from_today),
-    "twentieth": Choice(("random background",), seeds=(3, 4), tried=(3, 4), begun=from_today),
+    "twentieth": Choice(("random background",), seeds=(3, 4, 5), tried=(3, 4, 5), begun=from_today),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
