@@ -75,7 +75,7 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "threshold 2e-4": ("densify_gradient", 2e-4),
     "threshold 3e-4": ("densify_gradient", 3e-4),
     "degree 1": ("sh_degree", 1),
-    "random background": ("random_background", True),
+    "random background": ("random_background", "on"),
     "warp": ("loss", "warp("),
     "hidden left out": ("loss", "hidden="),
     "every second step": ("loss", "every=2"),
@@ -104,7 +104,11 @@ _FIGURES = "psnr", "ssim", "lpips", "ca_exact_half"
 CHOSEN = "drawn"
 """What the first choice chose, and the second started from: ``--recipe sparse --densify-from 150``."""
 LATER = "from 1,000"
-"""What the second choice chose: ``--recipe sparse``."""
+"""What the second choice chose: ``--recipe sparse --random-background off``."""
+TODAY = f"{LATER} + random background"
+"""What the twentieth chose: ``--recipe sparse``, but on `SHOWN`."""
+SHOWN = ("dtu-scan65", "dtu-scan24", "lego")
+"""The scenes whose photographs show the background, over which the recipe stays."""
 DENSE = "from 1,000, dense start"
 """The same as a user has it, with the start that it has by default."""
 ONE_EXPOSURE = "one exposure"
@@ -206,8 +210,12 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
     """
     if options is not None and options.one_exposure:
         return f"{candidate(config)} + {ONE_EXPOSURE}"
+    if config.random_background == "auto":
+        shown = options is not None and Path(options.path).name in SHOWN
+        config = dataclasses.replace(config, random_background="off" if shown else "on")
     if "distillation(" in config.loss:
-        return f"{LATER if config.dropout else 'plain'} + {_distilled(config.loss)}"
+        learner = "plain" if not config.dropout else LATER if config.random_background == "off" else TODAY
+        return f"{learner} + {_distilled(config.loss)}"
     begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
     if config.analytic:
         return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
@@ -229,7 +237,8 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
 def _distilled(loss: str) -> str:
     """Return which models a loss distills: how many, or if they are of several kinds, which the others are."""
     runs = [Path(ply).parent for ply in re.findall(r"'([^']*\.ply)'", loss)]
-    first, *others = (candidate(read_run_settings(run / "config.json")[1]) for run in runs)
+    members = (read_run_settings(run / "config.json")[1] for run in runs)
+    first, *others = (candidate(dataclasses.replace(member, random_background="off")) for member in members)
     kinds = [other.removeprefix(f"{LATER} + ") for other in others if other != first]
     steps = [f", {part}" for part in first.split(" + ") if part in _STEPS.values()]
     return f"distilled with {', '.join(kinds)}" if kinds else "".join([DISTILLED[len(runs)], *steps])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 from benchmarks import setting
@@ -12,6 +13,9 @@ from reference_trainer.runs.distill import distilled
 from reference_trainer.runs.folder import run_settings
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.recipes import with_recipe
+
+former = partial(with_recipe, random_background="off")
+"""A recipe as it was up to the twentieth choice."""
 
 
 def row(scene, candidate, seed, psnr, held_out=None):
@@ -93,9 +97,12 @@ def test_the_page_has_the_tables_of_its_rows():
 
 
 def test_the_recipe_is_what_was_chosen():
-    assert setting.candidate(with_recipe("sparse", iterations=3_000)) == setting.LATER
-    assert setting.candidate(with_recipe("sparse", iterations=2_000)) == setting.LATER
-    assert setting.candidate(with_recipe("sparse", iterations=2_000, densify_from=100)) == setting.CHOSEN
+    for iterations in (2_000, 3_000):
+        config = with_recipe("sparse", iterations=iterations)
+        assert setting.candidate(config) == setting.TODAY
+        assert setting.candidate(config, SceneOptions("data/lego")) == setting.LATER
+    first = with_recipe("sparse", iterations=2_000, densify_from=100, random_background="off")
+    assert setting.candidate(first) == setting.CHOSEN
     assert setting.candidate(with_recipe("3dgs", iterations=3_000)) == "plain"
     assert setting.candidate(with_recipe("3dgs", iterations=3_000, densify_from=1_000)) == "plain, from 1,000"
 
@@ -109,32 +116,32 @@ def test_a_candidate_of_the_second_choice_gains_over_the_mean_of_the_seeds():
 
 
 def test_a_rate_of_the_means_by_pixels_is_another_on_every_scene():
-    names = [
-        setting.candidate(with_recipe("sparse", iterations=3_000, means_rate=rate)) for rate in (6.4e-4, 2.5e-4, 5e-4)
-    ]
+    names = [setting.candidate(former("sparse", iterations=3_000, means_rate=rate)) for rate in (6.4e-4, 2.5e-4, 5e-4)]
     assert names == [f"from 1,000 + means {how}" for how in ("x4", "by pixels", "by pixels")]
 
 
 def test_a_distillation_is_named_by_the_number_of_its_models(tmp_path):
     (run := tmp_path / "run").mkdir()
     scene = SceneOptions("fern", points="dense_and_few.ply")
-    write_json(run / "config.json", run_settings(scene, with_recipe("sparse")))
+    write_json(run / "config.json", run_settings(scene, former("sparse")))
     for count, name in enumerate(("distilled, alone", "distilled of two", "distilled of three"), 1):
         members = ", ".join([repr(str(run / "point_cloud.ply"))] * count)
         options, config = distilled([run] * count)
         assert config.loss == f"photometric + distillation({members})"
         assert setting.candidate(config, options) == f"from 1,000 + {name}"
-    assert setting.candidate(with_recipe("sparse", iterations=6_000)) == "from 1,000 + twice the steps"
-    write_json(run / "config.json", run_settings(scene, with_recipe("sparse", iterations=1_500)))
+    assert setting.candidate(former("sparse", iterations=6_000)) == "from 1,000 + twice the steps"
+    write_json(run / "config.json", run_settings(scene, former("sparse", iterations=1_500)))
     assert setting.candidate(*reversed(distilled([run] * 2))).endswith(" two, half the steps")
     write_json(run / "config.json", run_settings(scene, with_recipe("3dgs", iterations=3_000)))
     assert setting.candidate(*reversed(distilled([run] * 2))) == "plain + distilled of two"
+    write_json(run / "config.json", run_settings(scene, with_recipe("sparse")))
+    assert setting.candidate(*reversed(distilled([run] * 2))) == f"{setting.TODAY} + distilled of two"
 
 
 def test_a_distillation_of_two_kinds_is_named_by_the_second(tmp_path):
     for folder, of in (
-        ("recipe", with_recipe("sparse")),
-        ("slow", with_recipe("sparse", means_rate=4e-5)),
+        ("recipe", former("sparse")),
+        ("slow", former("sparse", means_rate=4e-5)),
         ("other", with_recipe("binocular", dropout=0.2, loss="photometric + warp(1.0, relative=True)")),
     ):
         (tmp_path / folder).mkdir()
@@ -151,5 +158,5 @@ def test_a_warp_is_named_by_what_it_leaves_out():
         (hidden, "warp + hidden left out"),
         (f"{hidden}, every=2", "warp + hidden left out + every second step"),
     ):
-        config = with_recipe("sparse", iterations=3_000, loss=f"photometric + warp(between(1.0, 2000), {loss})")
+        config = former("sparse", iterations=3_000, loss=f"photometric + warp(between(1.0, 2000), {loss})")
         assert setting.candidate(config) == f"from 1,000 + {name}"

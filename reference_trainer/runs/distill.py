@@ -55,6 +55,7 @@ def distilled(members: Sequence[Path]) -> tuple[SceneOptions, TrainConfig]:
         seed=first.seed,
         dropout=first.dropout,
         noise=first.noise,
+        random_background=first.random_background,
         sh_degree=first.sh_degree,
         loss=f"photometric + distillation({', '.join(map(repr, paths))})",
     )

@@ -107,6 +107,14 @@ class Scene:
         return bool((self.background == 1).all())
 
     @property
+    def shows_background(self) -> bool:
+        """Whether training photographs may show it: some have an alpha channel, or over 1 % of all pixels its color."""
+        if any(view.alpha is not None for view in self.train):
+            return True
+        alike = [(view.image - self.background[:, None, None]).abs().amax(0) <= 0.05 for view in self.train]
+        return float(torch.cat([pixels.flatten() for pixels in alike]).float().mean()) > 0.01
+
+    @property
     def extent(self) -> float:
         """Radius of the training rig: 1.1 x the largest distance of a training camera from their mean position.
 

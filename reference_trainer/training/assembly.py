@@ -1,15 +1,16 @@
-"""From settings to objects: what the expressions of a `TrainConfig` name, made, and checked against each other."""
+"""From settings to what they ask for: the expressions of a `TrainConfig` made, and checked against each other."""
 
 from __future__ import annotations
 
 from ca_reg import Chain
 from ca_reg.regularizers import parse
 from reference_trainer.renderers import RENDERERS, Renderer
+from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.density import DENSITY, DensityStrategy
 from reference_trainer.training.losses import LOSSES, LossTerm
 
-__all__ = ["check", "make_density", "make_losses", "make_regularizer", "make_renderer"]
+__all__ = ["check", "draws_background", "make_density", "make_losses", "make_regularizer", "make_renderer"]
 
 
 def make_regularizer(config: TrainConfig) -> Chain:
@@ -32,6 +33,11 @@ def make_density(config: TrainConfig, index: int = 0) -> DensityStrategy:
 def make_renderer(config: TrainConfig) -> Renderer:
     """Make the renderer of the training views."""
     return RENDERERS.make_one(config.renderer)
+
+
+def draws_background(config: TrainConfig, scene: Scene) -> bool:
+    """Return whether the steps lie over random colors."""
+    return config.random_background == "on" or (config.random_background == "auto" and not scene.shows_background)
 
 
 def check(config: TrainConfig) -> None:

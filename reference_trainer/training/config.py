@@ -50,9 +50,10 @@ class TrainConfig:
     as many as ``iterations``: that alone; 0 never. Only models with a regularizer are guarded, of two views or more."""
     models: int = 1
     """Models that are trained side by side and compared with each other, 2 for CoR-GS and SE-GS; the first is kept."""
-    random_background: bool = False
+    random_background: Literal["off", "auto", "on"] = "off"
     """Train over a background color drawn anew at each step, which penalizes transparency (CoR-GS, SE-GS); photographs
-    with an alpha channel lie over it, too, so that what is empty stays empty."""
+    with an alpha channel lie over it, too, so that what is empty stays empty; auto: unless the photographs show the
+    scene's background."""
     renderer: str = "builtin"
     """Renderer of the training: "builtin", this package's own, "gsplat", which needs gsplat and a CUDA device, or
     "my_module:MyRenderer"."""
@@ -175,6 +176,8 @@ def saved_config(values: Any, where: str) -> TrainConfig:
         values = {_RENAMED_SETTINGS.get(name, name): value for name, value in values.items()}
         if isinstance(name := values.get("renderer"), str):
             values["renderer"] = _RENAMED_RENDERERS.get(name, name)
+        if isinstance(on := values.get("random_background"), bool):
+            values["random_background"] = "on" if on else "off"
     return settings_from(TrainConfig, values, where)
 
 
@@ -192,6 +195,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
     (("max_gaussians", "densify_until"), lambda x: x is None or x >= 0, "None or at least 0", ""),
     (("sh_degree",), lambda x: x in (0, 1, 2, 3), "0, 1, 2 or 3", ""),
     (("initial_points",), lambda x: x in ("all", "seen"), "all or seen", ""),
+    (("random_background",), lambda x: x in ("off", "auto", "on"), "off, auto or on", ""),
     (("prune_size",), lambda x: x is None or x > 0, "positive, or None to keep what is large", ""),
     (("means_rate", "means_rate_final", "initial_scale"), lambda x: x > 0, "positive", ""),
     (("initial_opacity", "opacity_reset"), lambda x: 0 < x < 1, "in (0, 1)", ""),

@@ -42,7 +42,7 @@ _INRIA = TrainConfig(
 _CORGS = TrainConfig(
     iterations=10_000,
     models=2,
-    random_background=True,
+    random_background="on",
     opacity_reset_from=501,
     loss="photometric + co_regularization(between(1.0, 500))",
     density="co_pruning(5.0)",
@@ -137,8 +137,10 @@ RECIPES: dict[str, Recipe] = {
             guard=3_000,
             dropout=0.2,
             opacity_decay=0.995,
+            random_background="auto",
         ),  # the schedule of 3dgs at 3,000 steps, but for the beginning of density control
-        "no publication: 3dgs densified later, dropout (Chen et al. 2025), Binocular3DGS's opacity decay, our guard",
+        "no publication: 3dgs densified later, dropout (Chen et al. 2025), Binocular3DGS's opacity decay, CoR-GS's "
+        "random background, our guard",
         "nothing; benchmarks/setting.md says how it was chosen",
     ),
     "distilled": Recipe(

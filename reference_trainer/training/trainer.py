@@ -21,7 +21,14 @@ from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.progress import progress_bar
 from reference_trainer.render import NotFiniteError
 from reference_trainer.scenes.scene import Scene
-from reference_trainer.training.assembly import check, make_density, make_losses, make_regularizer, make_renderer
+from reference_trainer.training.assembly import (
+    check,
+    draws_background,
+    make_density,
+    make_losses,
+    make_regularizer,
+    make_renderer,
+)
 from reference_trainer.training.checkpoint import load_checkpoint, read_state, save_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.interruption import TrainingStoppedError, hold_interrupts
@@ -85,6 +92,7 @@ class Trainer:
         self._shown: tuple[Tensor, Tensor] | None = None  # the last render, and its photograph
         self.views = [view.to(self.device) for view in scene.train]
         self.background = scene.background.to(self.device)
+        self._draws_background = draws_background(config, scene)
         self.models = [
             ModelState(scene, config, make_density(config, i), make_regularizer(config), device=self.device, index=i)
             for i in range(config.models)
@@ -300,7 +308,7 @@ class Trainer:
     def begin_steps(self) -> list[Step]:
         """Choose the view of the step and what regularizes it; return a `Step` for every model."""
         begun, steps, background = self.step >= self.config.regularize_from, list[Step](), self.background
-        if self.config.random_background:
+        if self._draws_background:
             generator = stream(self.config.seed, self.step, "background", self.device)
             background = torch.rand(3, generator=generator, device=self.device)
         view = self.views[view_order(self.config.seed, self.step, len(self.views))].over(background, self.background)

@@ -155,7 +155,8 @@ def test_an_expectation_needs_something_random():
 
 def test_settings_of_an_older_version_are_read_and_their_names_refused():
     old = dataclasses.asdict(TrainConfig(dropout=0.2))
-    old |= {"renderer": "torch", "fields": old.pop("models") + 1}
-    assert saved_config(old, "config.json") == TrainConfig(dropout=0.2, models=2)
+    old |= {"renderer": "torch", "fields": old.pop("models") + 1, "random_background": True}
+    assert saved_config(old, "config.json") == TrainConfig(dropout=0.2, models=2, random_background="on")
+    assert saved_config(old | {"random_background": False}, "config.json") == TrainConfig(dropout=0.2, models=2)
     with pytest.raises(ValueError, match=r"renderer 'torch' .*'builtin'"):
         TrainConfig(renderer="torch")

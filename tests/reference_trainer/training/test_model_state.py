@@ -190,7 +190,7 @@ def test_what_compares_models_needs_two(settings):
 
 
 def test_all_models_train_over_one_random_background(tiny_scene):
-    trainer = Trainer(tiny_scene, TrainConfig(iterations=9, models=2, random_background=True))
+    trainer = Trainer(tiny_scene, TrainConfig(iterations=9, models=2, random_background="on"))
     colors = []
     for _ in range(3):
         steps = trainer.begin_steps()
@@ -220,7 +220,7 @@ def test_photographs_with_an_alpha_channel_lie_over_the_random_background_too(ti
         for view in tiny_scene.train
     )
     scene = dataclasses.replace(tiny_scene, train=views, background=white)
-    trainer = Trainer(scene, TrainConfig(iterations=3, random_background=True))
+    trainer = Trainer(scene, TrainConfig(iterations=3, random_background="on"))
     (step,) = trainer.begin_steps()
     step.sample(depth=False)
     for view in (step.view, step.at(trainer.views[0]).view, step.at(trainer.views[1]).view):
@@ -228,6 +228,34 @@ def test_photographs_with_an_alpha_channel_lie_over_the_random_background_too(ti
     assert not step.background.equal(white)
     for name, (front, alpha) in fronts.items():  # what was photographed stays
         assert next(view for view in trainer.views if view.name == name).image.equal(over(white, front, alpha))
+
+
+@pytest.mark.parametrize(
+    ("background", "dark", "alpha", "drawn"),
+    [
+        (0.0, 1, False, True),  # of 200 pixels
+        (0.0, 3, False, False),
+        (1.0, 3, False, True),  # nothing in the picture is white
+        (0.0, 0, True, False),
+    ],
+)
+def test_auto_keeps_a_background_that_photographs_show(tiny_scene, background, dark, alpha, drawn):
+    image = torch.full((3, 10, 20), 0.5)
+    image[:, 0, :dark] = torch.tensor([0.0, 0.04, 0.02])[:, None]
+    image[2, 5] = 0.0  # blue is missing, which makes nothing black
+    camera = dataclasses.replace(tiny_scene.train[0].camera, width=20, height=10)
+    view = dataclasses.replace(
+        tiny_scene.train[0], camera=camera, image=image, alpha=torch.ones(10, 20) if alpha else None
+    )
+    scene = dataclasses.replace(tiny_scene, train=(view, view), background=torch.full((3,), background))
+    trainer = Trainer(scene, TrainConfig(iterations=2, random_background="auto"))
+    colors = []
+    for _ in range(2):
+        (step,) = trainer.begin_steps()
+        colors.append(step.background)
+        trainer.train_step()
+    assert (not colors[0].equal(colors[1])) is drawn
+    assert all(color.equal(scene.background) for color in colors) is not drawn
 
 
 @pytest.mark.parametrize("models", [1, 2])

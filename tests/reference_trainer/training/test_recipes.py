@@ -224,10 +224,11 @@ def test_terms_act_when_those_of_the_code_base_do(name, share):
                 assert sum(weights) == pytest.approx(weight(iteration), abs=1e-6), (kind, iteration)
 
 
-def test_sparse_is_3dgs_of_as_many_steps_with_four_options():
-    """Dropout, decay, the guard after the last step and density control from a third on, whatever the iterations."""
+def test_sparse_is_3dgs_of_as_many_steps_with_five_options():
+    """Dropout, decay, the guard at the end, a background of any color, density control from a third on."""
     for iterations in (1_000, 1_500, 3_000):
-        options = {"dropout": 0.2, "opacity_decay": 0.995, "guard": iterations, "densify_from": round(iterations / 3)}
+        options = {"dropout": 0.2, "opacity_decay": 0.995, "guard": iterations, "densify_from": round(iterations / 3),
+                   "random_background": "auto"}  # fmt: skip
         assert with_recipe("sparse", iterations=iterations) == with_recipe("3dgs", iterations=iterations, **options)
 
 
