@@ -27,7 +27,7 @@ from benchmarks.remedy import held_out
 from ca_reg.attribution import hanging
 from reference_trainer.evaluation.metrics import view_psnr
 from reference_trainer.evaluation.results import write_json
-from reference_trainer.evaluation.shares import blend_weights, unseen_shares
+from reference_trainer.evaluation.shares import blend_weights, unexplained, unseen_shares
 from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.runs.folder import read_run_settings
@@ -51,6 +51,9 @@ RULES: dict[str, dict[str, Any]] = {
     "pilot: 15 twice": {"ratio": 2.0, "alone": 0.0, "most": 15, "rounds": 2},
     "by shares": {"ratio": 64.0, "alone": 0.003, "together": 0.2, "by_shares": True},
     "by shares, unneeded": {"ratio": 64.0, "alone": 0.003, "together": 0.2, "by_shares": True, "spared": 0.3},
+    "worth 3": {"ratio": 16.0, "alone": 0.003, "together": 0.05, "worth": 3.0},
+    "worth 5": {"ratio": 16.0, "alone": 0.003, "together": 0.05, "worth": 5.0},
+    "worth 10": {"ratio": 16.0, "alone": 0.003, "together": 0.05, "worth": 10.0},
 }
 """The rules of the protocols, and those that were chosen."""
 
@@ -143,11 +146,13 @@ def keeps(
     fewer: bool = False,
     by_shares: bool = False,
     spared: float | None = None,
+    worth: float | None = None,
 ) -> tuple[Tensor, list[float], dict[str, int]]:
     """Return what a rule keeps, the score after each round, and where what went had its highest share.
 
     As `reference_trainer.evaluation.shares.guard`, with the alternatives of the protocol; ``known`` keeps what rules
-    with equal beginnings share. ``spared`` is what the training photographs may lose in the mean, dB.
+    with equal beginnings share. ``spared`` is what the training photographs may lose in the mean, dB; ``worth`` adds
+    those that are `unexplained`.
     """
     views: list[Viewpoint] = unseen_views(scene)
     if fewer:  # of 1/4, 1/2, 3/4 between the middle one, of 1/3, 2/3 and 1 beyond the last two
@@ -166,6 +171,8 @@ def keeps(
         shares, where_highest, there, here, score = known[key]
         scores.append(score)
         hang = hanging(shares, there, here, ratio=ratio, together=together, alone=alone)
+        if worth is not None:
+            hang |= unexplained(replace(model, gaussians=model.gaussians[keep]), scene.train, shares, worth)
         if most is not None:
             held = torch.where(hang, shares, 0.0)
             hang &= held >= held.sort(descending=True).values[min(most, len(held)) - 1]
