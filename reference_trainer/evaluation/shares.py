@@ -16,7 +16,7 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.render.densification import splat_weights
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
-from reference_trainer.scenes.virtual_cameras import amid_views, unseen_views
+from reference_trainer.scenes.virtual_cameras import FEW_CAMERAS, amid_views, unseen_views
 
 __all__ = [
     "PER_WEIGHT_SCALE", "WORTH", "Guard", "Heat", "all_but_highest", "blend_weights", "colored_by", "concentration",
@@ -101,27 +101,20 @@ class Guard:
 
 
 @torch.no_grad()
-def guard(
-    model: TrainedModel,
-    scene: Scene,
-    views: Sequence[Viewpoint] | None = None,
-    *,
-    rounds: int = 3,
-    worth: float = WORTH,
-) -> Guard:
+def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None = None, *, rounds: int = 3) -> Guard:
     """Find the Gaussians that hang where nobody took a photograph: `ca_reg.attribution.hanging`, or `unexplained`.
 
     What hangs is left out and the rest measured again, because it may have hidden more, until nothing hangs or
     ``rounds`` are over. All `unseen_views` are judged together. With many training cameras each of `amid_views` is
     also judged separately, because what hangs at one of many places is little in the mean over all. Scores are at the
-    drop rate of the training, at 0.2 if that is 0. Costs about four renders per camera and round.
+    drop rate of the training, at 0.2 if that is 0. Of `FEW_CAMERAS` photographs or fewer, what a Gaussian explains is
+    asked as well. Costs about four renders per camera and round.
 
     Args:
         model: which, trained with something that drops or is noisy.
         scene: with its training cameras.
         views: cameras that nobody took in the place of all `unseen_views`.
         rounds: how often to measure again, at most.
-        worth: as for `unexplained`.
 
     Raises:
         ValueError: if the model was trained without anything that drops or is noisy, whose Gaussians need each other,
@@ -148,8 +141,8 @@ def guard(
                 # At a single place divided by 3, not by all: what many photographs show is then rarely suspected.
                 mean = here / (len(taken) if of is together else 3)
                 found = hanging(shares, blend_weights(plain, of) / len(of), mean)
-                if of is together:
-                    found |= unexplained(rest, taken, shares, worth)
+                if of is together and len(taken) <= FEW_CAMERAS:
+                    found |= unexplained(rest, taken, shares)
                 found &= ~hang
                 where.update(of[i].name for i in where_highest[found].tolist())
                 hang |= found
