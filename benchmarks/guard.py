@@ -5,7 +5,8 @@
     python -m benchmarks.guard places RUN...                      # each place judged by itself
 
 A row is a model under a rule: PSNR at the test views, at the training views and at held-out views of training kind,
-which alone choose; how many Gaussians went, and the exact score where nobody was, before and after.
+which alone choose, and their pixels that two training photographs share; how many Gaussians went, and the exact score
+where nobody was, before and after.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ from torch import Tensor
 
 from benchmarks.remedy import held_out
 from ca_reg.attribution import hanging
+from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.metrics import view_psnr
 from reference_trainer.evaluation.results import write_json
-from reference_trainer.evaluation.shares import blend_weights, unexplained, unseen_shares
+from reference_trainer.evaluation.shares import blend_weights, unseen_shares
 from reference_trainer.evaluation.tables import markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.runs.folder import read_run_settings
@@ -35,8 +37,9 @@ from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 from reference_trainer.scenes.virtual_cameras import amid_views, unseen_views
+from reference_trainer.training.config import TrainConfig
 
-__all__ = ["RULES", "by_place", "held_out_views", "keeps", "main"]
+__all__ = ["RULES", "by_place", "held_out_views", "keeps", "main", "shared", "unexplained"]
 
 RULES: dict[str, dict[str, Any]] = {
     "ratio 2, 0.3 %": {"ratio": 2.0, "alone": 0.003},
@@ -98,8 +101,9 @@ def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
     """Return the rows of a run, "none" being the model as it is."""
     model, scene = load_run_model(run)
     options, config = read_run_settings(run / "config.json")
-    others = held_out_views(options, config.seed)
+    others = held_out_views(options, config)
     splits: dict[str, Sequence[View]] = dict(zip(_SPLITS, (others, scene.test, scene.train), strict=True))
+    splits["shared"] = shared(model, scene, others)
     known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, float]] = {}
     rows, of_kept = [], dict[bytes, dict[str, dict[str, float]]]()
     for name in rules:
@@ -115,21 +119,55 @@ def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
              "where": where, "seconds": time.process_time() - start}
             | {split: sum(of.values()) / max(1, len(of)) for split, of in found.items()} | {"views": found}
         )  # fmt: skip
-        shown = {split: round(rows[-1][split], 2) for split in _SPLITS}
+        shown = {split: round(rows[-1][split], 2) for split in splits}
         print(run.name, name, rows[-1]["removed"], shown, *(f"{1e3 * x:.2f}" for x in scores), flush=True)
     return rows
 
 
-def held_out_views(options: SceneOptions, seed: int) -> list[View]:
+def held_out_views(options: SceneOptions, config: TrainConfig) -> list[View]:
     """Return the held-out views of a scene, without those of another exposure."""
     others = OTHER_EXPOSURE.get(Path(options.path).name, ())
-    return [view for view in held_out(options, seed).test if view.name not in others]
+    return [view for view in held_out(options, config.seed).test if view.name not in others]
+
+
+def shared(model: TrainedModel, scene: Scene, views: Sequence[View]) -> list[View]:
+    """Return views whose masks leave the pixels that training photographs share, without views that have none.
+
+    These are the pixels whose surface, by the depth of the model, at least two training photographs show.
+    """
+    maps, found = ErrorMaps(model, scene.train), list[View]()
+    for view in views:
+        seen = (maps.support(view) >= 2).to(view.image)
+        mask = seen if view.mask is None else seen * view.mask
+        found += [replace(view, mask=mask)] if mask.any() else []
+    return found
 
 
 @torch.no_grad()
 def quality(model: TrainedModel, view: View) -> float:
     """Return the PSNR of a view."""
     return view_psnr(model.test_rendering(view).image, view)
+
+
+@torch.no_grad()
+def unexplained(model: TrainedModel, views: Sequence[View], shares: Tensor, worth: float) -> Tensor:
+    """Return which Gaussians risk more where nobody took a photograph than they explain of those taken, (N,), bool.
+
+    A Gaussian risks its share of the score, (N,), and explains by how much the mean squared error of the photographs
+    rises without it: both are squares of colors. Found are those with a hundredth of the score or more whose share is
+    more than ``worth`` times what they explain.
+    """
+
+    def error(of: TrainedModel) -> float:
+        return fmean((of.test_rendering(v).image.clamp(0, 1) - v.image).square().mean().item() for v in views)
+
+    found, whole = torch.zeros_like(shares, dtype=torch.bool), error(model)
+    for i in ((shares > 0) & (shares >= 0.01 * shares.sum())).nonzero()[:, 0].tolist():
+        rest = torch.ones_like(found)
+        rest[i] = False
+        rise = error(replace(model, gaussians=model.gaussians[rest])) - whole
+        found[i] = shares[i].item() > worth * max(rise, 0.0)
+    return found
 
 
 @torch.no_grad()
@@ -200,7 +238,7 @@ def by_place(run: Path, rounds: int = 3) -> str:
     """
     model, scene = load_run_model(run)
     options, config = read_run_settings(run / "config.json")
-    others = held_out_views(options, config.seed)
+    others = held_out_views(options, config)
 
     def figures(keep: Tensor) -> Tensor:
         rest = replace(model, gaussians=model.gaussians[keep])
@@ -230,16 +268,17 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     runs, rules = dict.fromkeys(r["run"] for r in rows), dict.fromkeys(r["rule"] for r in rows if r["rule"] != "none")
     of = {(r["run"], r["rule"]): r for r in rows}
     lines = []
+    splits = [split for split in (*_SPLITS[:2], "shared") if any(split in row for row in rows)]
     for run in runs:
         plain = of[run, "none"]
         line = {"model": run, "score": f"{1e3 * plain['scores'][0]:.2f}"}
-        line |= {f"{split} PSNR": f"{plain[split]:.2f}" for split in _SPLITS[:2]}
+        line |= {f"{split} PSNR": f"{plain[split]:.2f}" for split in splits}
         for rule in rules:
             if row := of.get((run, rule)):
-                changes = "/".join(f"{row[split] - plain[split]:+.2f}" for split in _SPLITS[:2])
+                changes = "/".join(f"{row[split] - plain[split]:+.2f}" for split in splits)
                 line[rule] = f"{changes} ({row['removed']})"
         lines.append(line)
-    titles = ["model", "score", *(f"{split} PSNR" for split in _SPLITS[:2]), *rules]
+    titles = ["model", "score", *(f"{split} PSNR" for split in splits), *rules]
     return markdown_table([dict.fromkeys(titles, "-") | line for line in lines], titles)
 
 

@@ -24,7 +24,7 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 
-from benchmarks.guard import held_out_views, quality
+from benchmarks.guard import held_out_views, quality, shared
 from benchmarks.paper.rows import Rows, value
 from benchmarks.paper.scenes import SCENES
 from benchmarks.start_scenes import FEW_AND_RANDOM, STARTS, from_dense
@@ -37,7 +37,6 @@ from reference_trainer.json_files import read_json
 from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.scenes.scene import View
 from reference_trainer.scenes.virtual_cameras import unseen_views
 from reference_trainer.training.config import TrainConfig
 
@@ -54,7 +53,6 @@ __all__ = [
     "references_of",
     "rows_of",
     "second",
-    "shared_views",
     "starts",
     "tables",
 ]
@@ -176,7 +174,8 @@ def main(
                 write_json(out, rows)
     elif what == "shared":
         rows = json.loads(out.read_text("utf-8"))
-        views = shared_views(paths[0])
+        model, scene = load_run_model(paths[0])
+        views = shared(model, scene, held_out_views(*read_run_settings(paths[0] / "config.json")))
         for run in paths[1:]:
             options, config = read_run_settings(run / "config.json")
             row = rows_of(rows, _scene(options), candidate(config, options))[config.seed]
@@ -253,7 +252,7 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
     row: Row = {"scene": _scene(options), "candidate": candidate(config, options), "seed": config.seed}
     compared = row["candidate"].removesuffix(f", {LATER}").removesuffix(RELATIVE) in _REFERENCES
     if (name in HELD_OUT or name.endswith("-many")) and not compared:
-        row["held-out"] = fmean(quality(model, view) for view in held_out_views(options, config.seed))
+        row["held-out"] = fmean(quality(model, view) for view in held_out_views(options, config))
     test, metric = results["mean"]["test"], results.get("perceptual_metric")
     if metric is None and perceptual is not None:
         shown = [
@@ -267,20 +266,6 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
             "cpu": results["machine"]["cpu"]}  # fmt: skip
     print(scene.name, row["candidate"], row["seed"], row.get("held-out"), row["test"], flush=True)
     return row
-
-
-def shared_views(run: Path) -> list[View]:
-    """Return the held-out views of a run's scene, whose masks leave the pixels that training photographs share.
-
-    These are the pixels whose surface, by the depth of the run's model, at least two training photographs show.
-    """
-    model, scene = load_run_model(run)
-    options, config = read_run_settings(run / "config.json")
-    maps, views = ErrorMaps(model, scene.train), list[View]()
-    for view in held_out_views(options, config.seed):
-        seen = (maps.support(view) >= 2).to(view.image)
-        views.append(dataclasses.replace(view, mask=seen if view.mask is None else seen * view.mask))
-    return views
 
 
 def choosing(rows: Sequence[Row]) -> str:

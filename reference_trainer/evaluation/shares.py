@@ -15,21 +15,17 @@ from reference_trainer.evaluation.pictures import heat_colors
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import SH_C0, Gaussians
 from reference_trainer.render.densification import splat_weights
-from reference_trainer.scenes.scene import Scene, View, Viewpoint
-from reference_trainer.scenes.virtual_cameras import FEW_CAMERAS, amid_views, unseen_views
+from reference_trainer.scenes.scene import Scene, Viewpoint
+from reference_trainer.scenes.virtual_cameras import amid_views, unseen_views
 
 __all__ = [
-    "PER_WEIGHT_SCALE", "WORTH", "Guard", "Heat", "all_but_highest", "blend_weights", "colored_by", "concentration",
-    "guard", "mean_shares", "share_per_weight", "unexplained", "unseen_shares", "where_it_shows",
+    "PER_WEIGHT_SCALE", "Guard", "Heat", "all_but_highest", "blend_weights", "colored_by", "concentration", "guard",
+    "mean_shares", "share_per_weight", "unseen_shares", "where_it_shows",
 ]  # fmt: skip
 
 PER_WEIGHT_SCALE = (0.1, 10.0)
 """Ends of the color scale for shares per blend weight, in units of the mean."""
 
-WORTH = 5.0
-"""How many times what a Gaussian explains of the photographs its share may be where nobody took one."""
-
-_SUSPECT = 0.01  # share of the score from which on a Gaussian must explain something
 _TOP = (0.001, 0.01, 0.1)
 _TOLD = 5  # places that a sentence names
 
@@ -102,13 +98,13 @@ class Guard:
 
 @torch.no_grad()
 def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None = None, *, rounds: int = 3) -> Guard:
-    """Find the Gaussians that hang where nobody took a photograph: `ca_reg.attribution.hanging`, or `unexplained`.
+    """Find the Gaussians that hang where nobody took a photograph, see `ca_reg.attribution.hanging`.
 
     What hangs is left out and the rest measured again, because it may have hidden more, until nothing hangs or
     ``rounds`` are over. All `unseen_views` are judged together. With many training cameras each of `amid_views` is
     also judged separately, because what hangs at one of many places is little in the mean over all. Scores are at the
-    drop rate of the training, at 0.2 if that is 0. Of `FEW_CAMERAS` photographs or fewer, what a Gaussian explains is
-    asked as well. Costs about four renders per camera and round.
+    drop rate of the training, at 0.2 if that is 0. No photograph is looked at. Costs about four renders
+    per camera and round.
 
     Args:
         model: which, trained with something that drops or is noisy.
@@ -140,10 +136,7 @@ def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None =
             if number < rounds:
                 # At a single place divided by 3, not by all: what many photographs show is then rarely suspected.
                 mean = here / (len(taken) if of is together else 3)
-                found = hanging(shares, blend_weights(plain, of) / len(of), mean)
-                if of is together and len(taken) <= FEW_CAMERAS:
-                    found |= unexplained(rest, taken, shares)
-                found &= ~hang
+                found = hanging(shares, blend_weights(plain, of) / len(of), mean) & ~hang
                 where.update(of[i].name for i in where_highest[found].tolist())
                 hang |= found
         scores.append(sum(of_views) / len(of_views))
@@ -151,38 +144,6 @@ def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None =
             break
         keep[keep.clone()] = ~hang
     return Guard(keep, where, tuple(scores))
-
-
-def unexplained(model: TrainedModel, views: Sequence[View], shares: Tensor, worth: float = WORTH) -> Tensor:
-    """Find the Gaussians that risk more where nobody took a photograph than they explain of those that were taken.
-
-    A veil may be a single Gaussian, far away and larger than all between, that every training camera sees a little. It
-    risks its share of the score; it explains by how much the mean squared error of the photographs rises without it.
-    Both are squares of colors. Gaussians with a hundredth of the score or more are asked, one by one; benchmarks/
-    setting.md has the numbers. Costs a render of every photograph for each.
-
-    Args:
-        model: which.
-        views: the photographs, on its device.
-        shares: from `unseen_shares`, (N,).
-        worth: how many times what a Gaussian explains its share may be.
-
-    Returns:
-        Which they are, (N,), bool.
-    """
-
-    def error(of: TrainedModel) -> float:
-        shown = (of.test_rendering(view).image.clamp(0, 1) - view.image for view in views)
-        return sum(difference.square().mean().item() for difference in shown) / len(views)
-
-    found, suspects = torch.zeros_like(shares, dtype=torch.bool), shares >= _SUSPECT * shares.sum()
-    whole = error(model)
-    for i in (suspects & (shares > 0)).nonzero()[:, 0].tolist():
-        rest = torch.ones_like(found)
-        rest[i] = False
-        rise = error(replace(model, gaussians=model.gaussians[rest])) - whole
-        found[i] = shares[i].item() > worth * max(rise, 0.0)
-    return found
 
 
 @torch.no_grad()
