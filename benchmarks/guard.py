@@ -37,7 +37,6 @@ from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene, View, Viewpoint
 from reference_trainer.scenes.virtual_cameras import amid_views, unseen_views
-from reference_trainer.training.config import TrainConfig
 
 __all__ = ["RULES", "by_place", "held_out_views", "keeps", "main", "shared", "unexplained"]
 
@@ -101,7 +100,7 @@ def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
     """Return the rows of a run, "none" being the model as it is."""
     model, scene = load_run_model(run)
     options, config = read_run_settings(run / "config.json")
-    others = held_out_views(options, config)
+    others = held_out_views(options, config.seed)
     splits: dict[str, Sequence[View]] = dict(zip(_SPLITS, (others, scene.test, scene.train), strict=True))
     splits["shared"] = shared(model, scene, others)
     known: dict[bytes, tuple[Tensor, Tensor, Tensor, Tensor, float]] = {}
@@ -124,10 +123,10 @@ def measure(run: Path, rules: Sequence[str]) -> list[dict[str, Any]]:
     return rows
 
 
-def held_out_views(options: SceneOptions, config: TrainConfig) -> list[View]:
+def held_out_views(options: SceneOptions, seed: int) -> list[View]:
     """Return the held-out views of a scene, without those of another exposure."""
     others = OTHER_EXPOSURE.get(Path(options.path).name, ())
-    return [view for view in held_out(options, config.seed).test if view.name not in others]
+    return [view for view in held_out(options, seed).test if view.name not in others]
 
 
 def shared(model: TrainedModel, scene: Scene, views: Sequence[View]) -> list[View]:
@@ -238,7 +237,7 @@ def by_place(run: Path, rounds: int = 3) -> str:
     """
     model, scene = load_run_model(run)
     options, config = read_run_settings(run / "config.json")
-    others = held_out_views(options, config)
+    others = held_out_views(options, config.seed)
 
     def figures(keep: Tensor) -> Tensor:
         rest = replace(model, gaussians=model.gaussians[keep])

@@ -174,8 +174,8 @@ def main(
                 write_json(out, rows)
     elif what == "shared":
         rows = json.loads(out.read_text("utf-8"))
-        model, scene = load_run_model(paths[0])
-        views = shared(model, scene, held_out_views(*read_run_settings(paths[0] / "config.json")))
+        options, config = read_run_settings(paths[0] / "config.json")
+        views = shared(*load_run_model(paths[0]), held_out_views(options, config.seed))
         for run in paths[1:]:
             options, config = read_run_settings(run / "config.json")
             row = rows_of(rows, _scene(options), candidate(config, options))[config.seed]
@@ -252,7 +252,7 @@ def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
     row: Row = {"scene": _scene(options), "candidate": candidate(config, options), "seed": config.seed}
     compared = row["candidate"].removesuffix(f", {LATER}").removesuffix(RELATIVE) in _REFERENCES
     if (name in HELD_OUT or name.endswith("-many")) and not compared:
-        row["held-out"] = fmean(quality(model, view) for view in held_out_views(options, config))
+        row["held-out"] = fmean(quality(model, view) for view in held_out_views(options, config.seed))
     test, metric = results["mean"]["test"], results.get("perceptual_metric")
     if metric is None and perceptual is not None:
         shown = [

@@ -192,6 +192,7 @@ def test_a_step_renders_no_depth_and_no_dropped_gaussian(tiny_scene, monkeypatch
         ("moments", TrainConfig(analytic=True, dropout=0.2), r"asked for \(analytic\)"),
         ("alpha masks", TrainConfig(loss="photometric + alpha(1.0)"), r"asked for: Alpha compares with them"),
         ("alpha masks", TrainConfig(random_background="on"), r"\(random_background\): the pictures"),
+        ("background", TrainConfig(random_background="auto"), r"\(random_background\): the photographs do not show it"),
         ("background", TrainConfig(random_background="on"), r"anew at each step \(random_background\): asked"),
     ],
 )
