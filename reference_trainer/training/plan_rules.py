@@ -83,7 +83,8 @@ def background(scene: Scene, config: TrainConfig) -> PlanItem:
         why = "the photographs do not show it" if config.random_background == "auto" else "asked for"
         return PlanItem("background", "used", f"a color drawn anew at each step (random_background): {why}")
     color = ", ".join(f"{value:g}" for value in scene.background.tolist())
-    return PlanItem("background", "used", f"({color}) behind everything; adding it takes less than 1% of a step")
+    shown = ", which photographs show" if config.random_background == "auto" else ""
+    return PlanItem("background", "used", f"({color}) behind everything{shown}; adding it takes less than 1% of a step")
 
 
 def depth_output(scene: Scene, config: TrainConfig) -> PlanItem:

@@ -203,6 +203,11 @@ def test_what_a_training_uses_is_not_said_to_be_left_out(tiny_scene, name, confi
     assert re.search(said, item.reason)
 
 
+def test_a_background_that_photographs_show_stays(tiny_scene):
+    item = items(masked(tiny_scene), TrainConfig(random_background="auto"))["background"]
+    assert (item.decision, "which photographs show" in item.reason) == ("used", True)
+
+
 def masked(scene):
     """Give every photograph an alpha channel."""
     train = tuple(dataclasses.replace(view, alpha=torch.ones_like(view.image[0])) for view in scene.train)
