@@ -174,7 +174,7 @@ def pairs_of(
     found: dict[str, list[tuple[float, float]]] = {}
     for scene in SCENES:
         start = scene if scene == "synthetic" else begun(scene)  # which has points of its own
-        own = {TODAY: LATER} if scene in SHOWN else {}
+        own = {TODAY: LATER} if scene in SHOWN else {}  # there the two are one setting
         before, after = (rows_of(rows, start, own.get(name, name)) for name in names)
         if start == scene and "plain" in names:
             before = references_of(rows, REFERENCES, scene)["plain"]

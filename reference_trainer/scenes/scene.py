@@ -108,7 +108,10 @@ class Scene:
 
     @property
     def shows_background(self) -> bool:
-        """Whether training photographs may show it: some have an alpha channel, or over 1 % of all pixels its color."""
+        """Whether training photographs may show it: by an alpha channel, or over 1 % of all pixels have its color.
+
+        No channel of such a pixel is off by more than 0.05.
+        """
         if any(view.alpha is not None for view in self.train):
             return True
         alike = [(view.image - self.background[:, None, None]).abs().amax(0) <= 0.05 for view in self.train]

@@ -65,6 +65,7 @@ def test_all_regularizers_are_one_expression(settings, text):
         ("means_rate", 0.0),
         ("means_rate_final", -1e-6),
         ("initial_points", "some"),
+        ("random_background", True),  # as it was before it had a third value
         ("initial_scale", 0.0),
         ("initial_opacity", 1.0),
         ("initial_opacity", 0.0),
