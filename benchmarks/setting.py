@@ -86,8 +86,6 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "needles, weakly": ("loss", "Needles(0.002,"),
     "limit 0.2": ("density", "LimitedDensity(0.2)"),
     "limit 0.1": ("density", "LimitedDensity(0.1)"),
-    "half size to 1,000": ("half_size_until", 1_000),
-    "half size to 2,000": ("half_size_until", 2_000),
     "opaque": ("initial_opacity", 0.5),
     "small": ("initial_scale", 0.5),
     "large": ("initial_scale", 1.5),

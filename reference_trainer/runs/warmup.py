@@ -14,6 +14,8 @@ from reference_trainer.progress import progress_bar
 from reference_trainer.render import describe_engine, render_moments, variance_shares
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes import synthetic_scene
+from reference_trainer.scenes.images import resize_image
+from reference_trainer.scenes.scene import View
 from reference_trainer.threads import threads_for
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.trainer import Trainer
@@ -58,7 +60,10 @@ def step_seconds(width: int, height: int, device: str = "cpu") -> float:
     Call `warm_up` first, or the time includes compilation.
     """
     scene = synthetic_scene(width=40, height=30, points=max(10, width * height // 10))
-    views = tuple(view.resized(width, height) for view in scene.train)
+    views = tuple(
+        View(view.name, view.camera.resized(width, height), resize_image(view.image, width, height))
+        for view in scene.train
+    )
     trainer = Trainer(replace(scene, train=views), TrainConfig(dropout=0.2), device)
     with threads_for(width * height):
         for number in range(_UNTIMED + _TIMED):

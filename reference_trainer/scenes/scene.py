@@ -7,10 +7,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from reference_trainer.camera import Camera
-from reference_trainer.scenes.images import resize_image
 
 if TYPE_CHECKING:
     from reference_trainer.model.gaussians import Gaussians
@@ -53,17 +51,6 @@ class View(Viewpoint):
         if self.alpha is None or background is before:
             return self
         return replace(self, image=self.image + (1 - self.alpha) * (background - before)[:, None, None])
-
-    def resized(self, width: int, height: int) -> View:
-        """Return the view at another size in pixels: depths by the nearest pixel, all else filtered."""
-        layers: dict[str, Any] = {"image": resize_image(self.image, width, height)}
-        for name in ("alpha", "mask"):
-            if (layer := getattr(self, name)) is not None:
-                layers[name] = resize_image(layer[None], width, height)[0]
-        for name in ("depth", "depth_prior"):
-            if (layer := getattr(self, name)) is not None:
-                layers[name] = interpolate(layer[None, None], (height, width), mode="nearest-exact")[0, 0]
-        return replace(self, camera=self.camera.resized(width, height), **layers)
 
     def as_taken(self, image: Tensor) -> Tensor:
         """Return the image (3, H, W), or a render of this view, with the photograph's own exposure."""

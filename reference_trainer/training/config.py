@@ -58,10 +58,6 @@ class TrainConfig:
     """Renderer of the training: "builtin", this package's own, "gsplat", which needs gsplat and a CUDA device, or
     "my_module:MyRenderer"."""
 
-    half_size_until: int = 0
-    """Number of steps before the photographs have their full size, and not half of it; 3DGS warms up in this way, from
-    a quarter."""
-
     sh_degree: int = 3
     """Degree of the spherical harmonics of the colors, 0 to 3."""
     sh_every: int = 500
@@ -193,10 +189,9 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
     (("iterations", "models"), lambda x: x >= 1, "at least 1", ""),
     (("dropout",), lambda x: 0 <= x < 1, "in [0, 1)", ": 0 turns it off"),
     (("noise",), lambda x: x >= 0, "at least 0", ": 0 turns it off"),
-    (("seed", "guard", "regularize_from", "half_size_until", "sh_every", "densify_from", "densify_every",
-      "opacity_reset_from", "opacity_reset_every", "prune_size_from", "densify_gradient", "dense_fraction",
-      "prune_opacity", "scales_rate", "quaternions_rate", "opacity_rate", "color_rate"),
-     lambda x: x >= 0, "at least 0", ""),
+    (("seed", "guard", "regularize_from", "sh_every", "densify_from", "densify_every", "opacity_reset_from",
+      "opacity_reset_every", "prune_size_from", "densify_gradient", "dense_fraction", "prune_opacity", "scales_rate",
+      "quaternions_rate", "opacity_rate", "color_rate"), lambda x: x >= 0, "at least 0", ""),
     (("max_gaussians", "densify_until"), lambda x: x is None or x >= 0, "None or at least 0", ""),
     (("sh_degree",), lambda x: x in (0, 1, 2, 3), "0, 1, 2 or 3", ""),
     (("initial_points",), lambda x: x in ("all", "seen"), "all or seen", ""),

@@ -174,24 +174,16 @@ def with_steps(expression: str, times: float) -> str:
     return re.sub(r"(?<![\w.])[1-9][\d_]{2,}(?![\w.])", lambda at: str(round(times * int(at[0]))), expression)
 
 
-_MARKS = (
-    "half_size_until",
-    "sh_every",
-    "densify_from",
-    "densify_until",
-    "prune_size_from",
-    "opacity_reset_from",
-    "guard",
-)
+_MARKS = "sh_every", "densify_from", "densify_until", "prune_size_from", "opacity_reset_from", "guard"
 
 
 def with_recipe(name: str, **changes: object) -> TrainConfig:
     """Return the settings of a recipe with some fields changed.
 
-    With other ``iterations`` the steps at which something begins or ends are scaled in proportion:
-    ``half_size_until``, ``sh_every``, ``densify_from``, ``densify_until``, ``prune_size_from``, ``opacity_reset_from``,
-    ``guard``, and in loss and density the whole numbers from 100 on. Rates and the steps between two densifications or
-    resets stay: the optimizer needs its time after either. ``changes`` are taken as they are.
+    With other ``iterations`` the steps at which something begins or ends are scaled in proportion: ``sh_every``,
+    ``densify_from``, ``densify_until``, ``prune_size_from``, ``opacity_reset_from``, ``guard``, and in loss and density
+    the whole numbers from 100 on. Rates and the steps between two densifications or resets stay: the optimizer needs
+    its time after either. ``changes`` are taken as they are.
 
     Args:
         name: a key of `RECIPES`.

@@ -91,11 +91,6 @@ class Trainer:
         self.removed: tuple[TrainedModel, Guard] | None = None
         self._shown: tuple[Tensor, Tensor] | None = None  # the last render, and its photograph
         self.views = [view.to(self.device) for view in scene.train]
-        self._halves = [
-            view.resized((view.camera.width + 1) // 2, (view.camera.height + 1) // 2)
-            for view in self.views
-            if config.half_size_until
-        ]
         self.background = scene.background.to(self.device)
         self._draws_background = draws_background(config, scene)
         self.models = [
@@ -316,13 +311,12 @@ class Trainer:
         if self._draws_background:
             generator = stream(self.config.seed, self.step, "background", self.device)
             background = torch.rand(3, generator=generator, device=self.device)
-        views = self._halves if self.step < self.config.half_size_until else self.views
-        view = views[view_order(self.config.seed, self.step, len(self.views))].over(background, self.background)
+        view = self.views[view_order(self.config.seed, self.step, len(self.views))].over(background, self.background)
         for model in self.models:
             step = Step(
                 self.step,
                 view,
-                views,
+                self.views,
                 model.gaussians,
                 model.regularizer if begun else Chain(),
                 background,

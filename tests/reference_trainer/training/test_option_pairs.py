@@ -66,12 +66,7 @@ SCHEDULE = {  # what decides when and how fast, and enters no single step
 
 def test_every_setting_is_an_option_here_or_a_matter_of_the_schedule():
     named = {field for settings in OPTIONS.values() for field in settings} - {"recipe"}
-    elsewhere = {
-        "regularizer",
-        "models",
-        "random_background",
-        "half_size_until",
-    }  # test_every_regularizer.py, test_models.py
+    elsewhere = {"regularizer", "models", "random_background"}  # test_every_regularizer.py, test_models.py
     assert named | SCHEDULE | elsewhere == {field.name for field in dataclasses.fields(TrainConfig)}
     assert not named & SCHEDULE
 

@@ -253,22 +253,6 @@ def test_regularizers_wait_for_their_step(tiny_scene):
     assert_identical(plain, late)
 
 
-def test_the_first_steps_take_photographs_of_half_the_size(tiny_scene, tmp_path):
-    config = TrainConfig(iterations=4, dropout=0.3, half_size_until=2, random_background="on")
-    halves = tuple(v.resized(math.ceil(v.camera.width / 2), math.ceil(v.camera.height / 2)) for v in tiny_scene.train)
-    small = Trainer(dataclasses.replace(tiny_scene, train=halves), dataclasses.replace(config, half_size_until=0))
-    begun = Trainer(tiny_scene, config)
-    for trainer in (small, begun):
-        trainer.train(until=2)
-    assert_identical(small, begun)
-    begun.save(tmp_path / "checkpoint.pt")
-    rest = Trainer.load(tmp_path / "checkpoint.pt", tiny_scene)
-    rest.config = dataclasses.replace(config, half_size_until=0)
-    for trainer in (begun, rest):
-        trainer.train()
-    assert_identical(begun, rest)
-
-
 def control(monkeypatch, scene: Scene, config: TrainConfig, steps: int) -> dict[str, list[int]]:
     """Run with nothing but the calls of density control, and list the steps of each."""
     trainer = Trainer(scene, config)
