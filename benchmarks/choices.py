@@ -40,8 +40,8 @@ from reference_trainer.evaluation.tables import format_mean_std, markdown_table,
 
 __all__ = [
     "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_DEFAULT", "BY_TODAYS", "CHOICES", "ENSEMBLE", "KINDS",
-    "PLAIN_ENSEMBLE", "SHARPER", "SHORTER", "SLOWER_MEANS", "Choice", "from_same_start", "gains_of", "pairs_of",
-    "tables",
+    "PLAIN_ENSEMBLE", "SHARPER", "SHORTER", "SLOWER_MEANS", "TODAYS_BESIDE_BINOCULAR", "Choice",
+    "from_same_start", "gains_of", "pairs_of", "tables",
 ]  # fmt: skip
 
 
@@ -127,6 +127,8 @@ BESIDE_BINOCULAR = tuple(
     for name in (DISTILLED[2], _THREE_KINDS, _WITH_BINOCULAR, *_SHORTER[2:])
 )
 """All these beside Binocular3DGS, from the start that a user has."""
+TODAYS_BESIDE_BINOCULAR = {f"{BINOCULAR}{RELATIVE}": BINOCULAR, TODAY: "recipe"}
+"""The recipe beside it, from the start as it is now."""
 _JUDGED = (
     SLOWER_MEANS, SHARPER, ENSEMBLE, PLAIN_ENSEMBLE, *KINDS, *SHORTER, BESIDE_TWO, *BESIDE_BINOCULAR, BY_DEFAULT,
     BESIDE_DROPOUT,
@@ -136,7 +138,7 @@ _JUDGED = (
 def tables(rows: Sequence[Row]) -> list[str]:
     """Return all tables of the later choices."""
     gained = [gains_of(rows, choice) for choice in CHOICES.values()]
-    today = [from_same_start(rows, titles, from_today) for titles in (BY_DEFAULT, BY_TODAYS)]
+    today = [from_same_start(rows, titles, from_today) for titles in (BY_DEFAULT, BY_TODAYS, TODAYS_BESIDE_BINOCULAR)]
     return [*gained, *(from_same_start(rows, titles) for titles in _JUDGED), *today]
 
 
