@@ -117,7 +117,7 @@ DISTILLED = {1: "distilled, alone", 2: "distilled of two", 3: "distilled of thre
 """What the eleventh choice adds, by the number of models."""
 TWICE, HALF, THIRD = "twice the steps", "half the steps", "a third of the steps"
 """What takes as long as the second of these, and what the thirteenth choice distills."""
-_STEPS = {6_000: TWICE, 1_500: HALF, 1_000: THIRD}
+_STEPS = {6_000: TWICE, 1_500: HALF, 1_000: THIRD, 5_000: "5,000 steps", 2_500: "2,500 steps"}
 """The names by the number of steps."""
 BINOCULAR, RELATIVE = "Binocular3DGS, dropout", ", relative shift"
 """A setting of others, and the end of its name where the shift of its warp goes by the distance of the cameras."""
