@@ -1,6 +1,6 @@
 """The later choices of the setting for few photographs, by the rows of `benchmarks.setting`; see benchmarks/setting.md.
 
-python -m benchmarks.choices benchmarks/data/setting.json
+python -m benchmarks.choices benchmarks/data/setting.json    # or quality.json
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from reference_trainer.evaluation.tables import format_mean_std, markdown_table,
 
 __all__ = [
     "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_DEFAULT", "BY_TODAYS", "CHOICES", "ENSEMBLE", "KINDS",
-    "PLAIN_ENSEMBLE", "SHARPER", "SHORTER", "SLOWER_MEANS", "TODAYS_BESIDE_BINOCULAR", "Choice",
-    "from_same_start", "gains_of", "pairs_of", "tables",
+    "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER", "SLOWER_MEANS", "TODAYS_BESIDE_BINOCULAR", "Choice",
+    "from_same_start", "gains_of", "of_quality", "pairs_of", "tables",
 ]  # fmt: skip
 
 
@@ -129,6 +129,14 @@ BESIDE_BINOCULAR = tuple(
 """All these beside Binocular3DGS, from the start that a user has."""
 TODAYS_BESIDE_BINOCULAR = {f"{BINOCULAR}{RELATIVE}": BINOCULAR, TODAY: "recipe"}
 """The recipe beside it, from the start as it is now."""
+QUALITY = {
+    f"{TODAY} + 5,000 steps": "one of 5,000",
+    f"{LATER} + distilled with {HALF}": "two of 3,000",
+    f"{LATER} + distilled with 2,500 steps": "two of 5,000",
+    f"{TODAY} + D-SSIM 0.4 + 5,000 steps": "one of 5,000, sharper",
+    f"{LATER} + threshold 3e-4 + random background + D-SSIM 0.4 + 5,000 steps": "one of 5,000, sharper and finer",
+}
+"""What the twenty-second choice trained for `ca-reg run --quality`, in rows of photographs as they are kept."""
 _JUDGED = (
     SLOWER_MEANS, SHARPER, ENSEMBLE, PLAIN_ENSEMBLE, *KINDS, *SHORTER, BESIDE_TWO, *BESIDE_BINOCULAR, BY_DEFAULT,
     BESIDE_DROPOUT,
@@ -136,10 +144,31 @@ _JUDGED = (
 
 
 def tables(rows: Sequence[Row]) -> list[str]:
-    """Return all tables of the later choices."""
+    """Return all tables of the later choices; of rows of photographs as they are kept, that of `QUALITY`."""
+    if any(row["candidate"] == next(iter(QUALITY)) for row in rows):
+        return [of_quality(rows)]
     gained = [gains_of(rows, choice) for choice in CHOICES.values()]
     today = [from_same_start(rows, titles, from_today) for titles in (BY_DEFAULT, BY_TODAYS, TODAYS_BESIDE_BINOCULAR)]
     return [*gained, *(from_same_start(rows, titles) for titles in _JUDGED), *today]
+
+
+def of_quality(rows: Sequence[Row]) -> str:
+    """Return a table of the candidates of `QUALITY`: held-out / test PSNR, LPIPS, thousands of Gaussians, and seconds.
+
+    These are means over the seeds in brackets.
+    """
+    lines = []
+    for name, title in QUALITY.items():
+        lines.append({"candidate": title})
+        for scene in SCENES:
+            own = name.replace(f"{LATER} + random background", LATER) if scene in SHOWN else name
+            if of := rows_of(rows, from_today(scene), own):
+                figures = "held-out", "test psnr", "test lpips", "gaussians", "seconds"
+                shown = [fmean(value(row, figure) for row in of.values()) for figure in figures]
+                text = f"{shown[0]:.2f} / {shown[1]:.2f}, {shown[2]:.3f}, {shown[3] / 1e3:.0f}, {shown[4]:.0f} s"
+                lines[-1][scene] = f"{text} ({len(of)})"
+    columns = ["candidate", *(scene for scene in SCENES if any(scene in line for line in lines))]
+    return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 
 
 def gains_of(rows: Sequence[Row], choice: Choice) -> str:

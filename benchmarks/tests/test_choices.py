@@ -6,6 +6,8 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from benchmarks import setting
 from benchmarks.choices import BY_DEFAULT, CHOICES, SLOWER_MEANS, from_same_start, gains_of, tables
 from benchmarks.tests.test_setting import row
@@ -60,8 +62,9 @@ def test_settings_from_the_same_start_are_met_by_seeds_that_both_have():
     assert from_same_start(rows, SLOWER_MEANS).startswith("Nothing")
 
 
-def test_the_page_has_the_tables_of_its_rows():
+@pytest.mark.parametrize("name", ["setting.json", "quality.json"])
+def test_the_page_has_the_tables_of_its_rows(name):
     lines = Path(setting.__file__).with_suffix(".md").read_text("utf-8").splitlines()
-    rows = json.loads((setting.REFERENCES.parent / "setting.json").read_text("utf-8"))
+    rows = json.loads((setting.REFERENCES.parent / name).read_text("utf-8"))
     for table in tables(rows):
         assert [line for line in table.splitlines() if line and line not in lines] == []
