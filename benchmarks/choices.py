@@ -39,9 +39,9 @@ from benchmarks.start_scenes import from_dense, from_today
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
-    "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_DEFAULT", "BY_TODAYS", "CHOICES", "ENSEMBLE", "KINDS",
-    "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER", "SLOWER_MEANS", "TODAYS_BESIDE_BINOCULAR", "Choice",
-    "from_same_start", "gains_of", "of_quality", "pairs_of", "tables",
+    "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_DEFAULT", "BY_TODAYS", "CHOICES", "DROPOUT_ALONE",
+    "ENSEMBLE", "KINDS", "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER", "SLOWER_MEANS", "TODAYS_BESIDE_BINOCULAR",
+    "Choice", "from_same_start", "gains_of", "of_quality", "pairs_of", "tables",
 ]  # fmt: skip
 
 
@@ -106,6 +106,8 @@ SHARPER = {LATER: "recipe", f"{LATER} + {_SHAPES[1]}": _SHAPES[1]}
 """The judgement of the ninth choice, likewise."""
 BESIDE_DROPOUT = {"dropout": "dropout alone", LATER: "recipe"}
 """The recipe beside dropout alone, from the start that a user has."""
+DROPOUT_ALONE = {"plain": "plain", "dropout": "dropout alone"}
+"""What the two lines of the README gain from there."""
 BY_DEFAULT = {"plain": "plain", LATER: "recipe"}
 """What the recipe gained from the start that a user has: from the dense start as it was, and as it is now."""
 BY_TODAYS = {"plain": "plain", TODAY: "recipe"}
@@ -139,7 +141,7 @@ QUALITY = {
 """What the twenty-second choice trained for `ca-reg run --quality`, in rows of photographs as they are kept."""
 _JUDGED = (
     SLOWER_MEANS, SHARPER, ENSEMBLE, PLAIN_ENSEMBLE, *KINDS, *SHORTER, BESIDE_TWO, *BESIDE_BINOCULAR, BY_DEFAULT,
-    BESIDE_DROPOUT,
+    BESIDE_DROPOUT, DROPOUT_ALONE,
 )  # fmt: skip
 
 
@@ -161,7 +163,7 @@ def of_quality(rows: Sequence[Row]) -> str:
     for name, title in QUALITY.items():
         lines.append({"candidate": title})
         for scene in SCENES:
-            own = name.replace(f"{LATER} + random background", LATER) if scene in SHOWN else name
+            own = name.replace(TODAY, LATER) if scene in SHOWN else name
             if of := rows_of(rows, from_today(scene), own):
                 figures = "held-out", "test psnr", "test lpips", "gaussians", "seconds"
                 shown = [fmean(value(row, figure) for row in of.values()) for figure in figures]
