@@ -39,9 +39,28 @@ from benchmarks.start_scenes import from_dense, from_today
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
-    "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_DEFAULT", "BY_TODAYS", "CHOICES", "DROPOUT_ALONE",
-    "ENSEMBLE", "KINDS", "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER", "SLOWER_MEANS", "TODAYS_BESIDE_BINOCULAR",
-    "Choice", "from_same_start", "gains_of", "of_quality", "pairs_of", "tables",
+    "BESIDE_BINOCULAR",
+    "BESIDE_DROPOUT",
+    "BESIDE_TWO",
+    "BY_DEFAULT",
+    "BY_TODAYS",
+    "CHOICES",
+    "DROPOUT_ALONE",
+    "ENSEMBLE",
+    "KINDS",
+    "PLAIN_ENSEMBLE",
+    "QUALITY",
+    "SHARPER",
+    "SHORTER",
+    "SLOWER_MEANS",
+    "TODAYS_BESIDE_BINOCULAR",
+    "WITHOUT",
+    "Choice",
+    "figures_of",
+    "from_same_start",
+    "gains_of",
+    "pairs_of",
+    "tables",
 ]  # fmt: skip
 
 
@@ -56,6 +75,7 @@ class Choice:
         figure: whether all pixels of the held-out views count, or the shared ones.
         starts: whether the names are of points.
         begun: names a scene with the start of all.
+        over: the recipe.
     """
 
     names: tuple[str, ...]
@@ -64,6 +84,7 @@ class Choice:
     figure: Literal["held-out", "shared"] = "held-out"
     starts: bool = False
     begun: Callable[[str], str] = from_dense
+    over: str = LATER
 
 
 _HIDDEN = "warp + hidden left out"
@@ -77,6 +98,7 @@ _SHORTER = (
 )  # fmt: skip
 _OVER_MEAN = (MEAN_BACKGROUND, f"random background + {MEAN_BACKGROUND}")
 _BEGINNINGS = ("opaque", "small", "opaque + small", "large")
+_WITHOUT = "without dropout", "without decay"
 _COUNTS = ("5,000 dense and few", "8,000 dense and few", "30,000 dense and few", "filled")
 CHOICES = {
     "third": Choice(("rate 0.3", "no reset", "threshold 3e-4"), seeds=(0,)),
@@ -99,6 +121,8 @@ CHOICES = {
     "nineteenth": Choice(_BEGINNINGS, seeds=range(3), figure="shared", begun=from_today),
     "nineteenth, second round": Choice(_BEGINNINGS, seeds=range(3), tried=(0, 1, 2), figure="shared", begun=from_today),
     "twentieth": Choice(("random background",), seeds=(3, 4, 5), tried=(3, 4, 5), begun=from_today),
+    "twenty-third": Choice((f"limit 0.2 + {MEAN_BACKGROUND}",), seeds=(2,), tried=(2,), begun=from_today, over=TODAY),
+    "twenty-fourth": Choice(_WITHOUT, seeds=range(3), tried=(0, 1, 2), begun=from_today, over=TODAY),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
@@ -139,6 +163,17 @@ QUALITY = {
     f"{LATER} + threshold 3e-4 + random background + D-SSIM 0.4 + 5,000 steps": "one of 5,000, sharper and finer",
 }
 """What the twenty-second choice trained for `ca-reg run --quality`, in rows of photographs as they are kept."""
+WITHOUT = {"plain": "plain", TODAY: "recipe"} | {f"{TODAY} + {name}": name for name in _WITHOUT}
+"""What the twenty-fourth leaves out, beside what it leaves it out of."""
+_UNITS = {
+    "held-out": ("held-out", 1.0),
+    "psnr": ("test psnr", 1.0),
+    "lpips": ("test lpips", 1.0),
+    "score": ("test ca_exact_half", 1e3),
+    "thousands": ("gaussians", 1e-3),
+    "seconds": ("seconds", 1.0),
+}
+"""What a template of `figures_of` may name: a figure of the rows, and what it is multiplied by."""
 _JUDGED = (
     SLOWER_MEANS, SHARPER, ENSEMBLE, PLAIN_ENSEMBLE, *KINDS, *SHORTER, BESIDE_TWO, *BESIDE_BINOCULAR, BY_DEFAULT,
     BESIDE_DROPOUT, DROPOUT_ALONE,
@@ -148,27 +183,30 @@ _JUDGED = (
 def tables(rows: Sequence[Row]) -> list[str]:
     """Return all tables of the later choices; of rows of photographs as they are kept, that of `QUALITY`."""
     if any(row["candidate"] == next(iter(QUALITY)) for row in rows):
-        return [of_quality(rows)]
+        return [figures_of(rows, QUALITY, "{held-out:.2f} / {psnr:.2f}, {lpips:.3f}, {thousands:.0f}, {seconds:.0f} s")]
     gained = [gains_of(rows, choice) for choice in CHOICES.values()]
     today = [from_same_start(rows, titles, from_today) for titles in (BY_DEFAULT, BY_TODAYS, TODAYS_BESIDE_BINOCULAR)]
-    return [*gained, *(from_same_start(rows, titles) for titles in _JUDGED), *today]
+    without = figures_of(rows, WITHOUT, "{psnr:.2f}, {lpips:.3f}, {score:.2f}, {thousands:.0f}", range(3))
+    return [*gained, *(from_same_start(rows, titles) for titles in _JUDGED), *today, without]
 
 
-def of_quality(rows: Sequence[Row]) -> str:
-    """Return a table of the candidates of `QUALITY`: held-out / test PSNR, LPIPS, thousands of Gaussians, and seconds.
+def figures_of(rows: Sequence[Row], titles: Mapping[str, str], template: str, seeds: Sequence[int] = range(20)) -> str:
+    """Return a table of figures from today's start, by candidate and scene: means over the seeds, their number behind.
 
-    These are means over the seeds in brackets.
+    Args:
+        rows: all of them.
+        titles: of the candidates, by the names of their rows.
+        template: of a cell, with names of `_UNITS`.
+        seeds: those that count.
     """
+    named = {name: of for name, of in _UNITS.items() if f"{{{name}:" in template}
     lines = []
-    for name, title in QUALITY.items():
+    for name, title in titles.items():
         lines.append({"candidate": title})
         for scene in SCENES:
-            own = name.replace(TODAY, LATER) if scene in SHOWN else name
-            if of := rows_of(rows, from_today(scene), own):
-                figures = "held-out", "test psnr", "test lpips", "gaussians", "seconds"
-                shown = [fmean(value(row, figure) for row in of.values()) for figure in figures]
-                text = f"{shown[0]:.2f} / {shown[1]:.2f}, {shown[2]:.3f}, {shown[3] / 1e3:.0f}, {shown[4]:.0f} s"
-                lines[-1][scene] = f"{text} ({len(of)})"
+            if of := [row for seed, row in _rows(rows, scene, name, from_today).items() if seed in seeds]:
+                means = {x: unit * fmean(value(row, figure) for row in of) for x, (figure, unit) in named.items()}
+                lines[-1][scene] = f"{template.format(**means)} ({len(of)})".replace("nan", "-")
     columns = ["candidate", *(scene for scene in SCENES if any(scene in line for line in lines))]
     return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 
@@ -180,8 +218,9 @@ def gains_of(rows: Sequence[Row], choice: Choice) -> str:
         line, gains = {"candidate": name}, list[tuple[float, float]]()
         for scene in HELD_OUT:
             start = choice.begun(scene)
-            own = (f"{scene}, {name}", LATER) if choice.starts else (start, f"{LATER} + {name}")
-            recipe, found = rows_of(rows, start, LATER), rows_of(rows, *own)
+            over = _on(scene, choice.over)
+            own = (f"{scene}, {name}", over) if choice.starts else (start, f"{over} + {name}")
+            recipe, found = rows_of(rows, start, over), rows_of(rows, *own)
             before, after = (
                 [(of[s][figure], value(of[s], "test psnr"), of[s]["gaussians"]) for s in who if figure in of.get(s, ())]
                 for of, who in ((recipe, choice.seeds), (found, choice.tried))
@@ -197,6 +236,18 @@ def gains_of(rows: Sequence[Row], choice: Choice) -> str:
     return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 
 
+def _on(scene: str, name: str) -> str:
+    """Return the name that a setting has on a scene: where the photographs show the background, it stays."""
+    return name.replace(TODAY, LATER) if scene in SHOWN else name
+
+
+def _rows(rows: Sequence[Row], scene: str, name: str, begun: Callable[[str], str]) -> dict[int, Row]:
+    """Return the rows of a setting with a start, by seed."""
+    if scene == "synthetic":  # which has points of its own, and whose plain trainings are those of the paper's grid
+        return references_of(rows, REFERENCES, scene)["plain"] if name == "plain" else rows_of(rows, scene, name)
+    return rows_of(rows, begun(scene), _on(scene, name))
+
+
 def pairs_of(
     rows: Sequence[Row], names: Collection[str], begun: Callable[[str], str] = from_dense
 ) -> dict[str, list[tuple[float, float]]]:
@@ -206,11 +257,7 @@ def pairs_of(
     """
     found: dict[str, list[tuple[float, float]]] = {}
     for scene in SCENES:
-        start = scene if scene == "synthetic" else begun(scene)  # which has points of its own
-        own = {TODAY: LATER} if scene in SHOWN else {}  # there the two are one setting
-        before, after = (rows_of(rows, start, own.get(name, name)) for name in names)
-        if start == scene and "plain" in names:
-            before = references_of(rows, REFERENCES, scene)["plain"]
+        before, after = (_rows(rows, scene, name, begun) for name in names)
         if shared := sorted(before.keys() & after.keys()):
             found[scene] = [(value(before[seed], "test psnr"), value(after[seed], "test psnr")) for seed in shared]
     return found

@@ -95,6 +95,8 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "opacities x1/2": ("opacity_rate", 0.025),
     "scales x1/2": ("scales_rate", 2.5e-3),
     "colors x1/2": ("color_rate", 1.25e-3),
+    "without dropout": ("dropout", 0.0),
+    "without decay": ("opacity_decay", 1.0),
 }
 """What a candidate of the later choices changes in the chosen setting: a field and its value or values, of a loss the
 term."""
@@ -218,7 +220,7 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
     begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
     if config.analytic:
         return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
-    if config.opacity_decay < 1 and config.guard:
+    if config.guard:  # which is the recipe's alone
         config = dataclasses.replace(config, densify_from=begins)
         values = {name: (getattr(config, field), value) for name, (field, value) in _SECOND.items()}
         changes = [
