@@ -2,6 +2,7 @@
 
 - :class:`GaussianDropout` and :class:`OpacityNoise` regularize the activated opacities on their way to the rasterizer;
   :class:`Chain` combines them. :func:`scale_opacity` and :func:`expected_opacity` are their test-time counterparts.
+- :class:`OpacityDecay` fades what no photograph holds up, after every optimizer step.
 - :class:`CAScore` measures co-adaptation with any render callable: by sampling, or exactly if the renderer offers
   moments. :class:`CAMonitor` logs it during training, and :func:`attribute` tells which Gaussians it comes from.
 - :class:`CAPenalty` replaces sampled dropout or noise in training by the expected render, with the exact co-adaptation
@@ -20,6 +21,7 @@ Importing this package loads torch and numpy only.
 
 from ca_reg.attribution import attribute
 from ca_reg.chain import Chain
+from ca_reg.decay import OpacityDecay
 from ca_reg.error_maps import ErrorMap, error_map
 from ca_reg.functional import expected_opacity, scale_opacity
 from ca_reg.monitor import CAMonitor
@@ -32,7 +34,7 @@ from ca_reg.score import CAScore
 __version__ = "0.2.0"
 
 __all__ = [  # noqa: RUF022  # in the order in which one meets them, which the API page follows
-    "GaussianDropout", "OpacityNoise", "Chain", "CAScore",
+    "GaussianDropout", "OpacityNoise", "Chain", "OpacityDecay", "CAScore",
     "CAResult", "Reason", "CAMonitor", "CAPenalty", "attribute", "error_map", "ErrorMap",
     "IndependentDropout", "Regularizer", "Params", "Draw", "scale_opacity", "expected_opacity",
     "__version__",

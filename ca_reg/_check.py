@@ -77,6 +77,13 @@ def check_rates(p: Any) -> None:
         )
 
 
+def check_factor(factor: Any) -> None:
+    """Raise unless ``factor``, by which opacities decay, is a real number in (0, 1]."""
+    check_finite(factor, "factor")
+    if not 0.0 < factor <= 1.0:
+        raise ValueError(f"factor must be in (0, 1], got {factor}; opacities are multiplied by it after every step.")
+
+
 def check_sigma(sigma: Any, name: str = "sigma") -> None:
     """Raise unless ``sigma`` is a real number in [0, 1e30]."""
     check_finite(sigma, name, minimum=0.0)

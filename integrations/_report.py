@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import abc
 from collections import Counter
+from collections.abc import MutableMapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import TracebackType
 from typing import Any, Self
+from weakref import WeakKeyDictionary
 
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 
+from ca_reg import OpacityDecay
 from ca_reg._check import check_count
 
 
@@ -38,6 +41,7 @@ class Tally:
     first_step: int | None = None
     last_step: int | None = None
     lost: int = 0  # training steps without a render that could be regularized
+    decayed: int = 0  # optimizer steps after which opacities were decayed
 
     def count_regularized(self, step: int) -> None:
         """Count a regularized render."""
@@ -75,6 +79,8 @@ class Tally:
         steps = "" if self.first_step is None else f", steps {self.first_step} to {self.last_step}"
         lines = [f"{self.regularized} renders regularized{steps}", f"{self.scaled} renders scaled for evaluation"]
         lines += [f"{count} renders left alone: {reason.value}" for reason, count in self.skipped.most_common()]
+        if self.decayed:
+            lines.append(f"opacities decayed after {self.decayed} optimizer steps")
         if self.lost:
             lines.append(f"{self.lost} training steps without a render that could be regularized")
         if not self.regularized + self.scaled:
@@ -89,15 +95,17 @@ class Hook(abc.ABC):
     """Regularizes scripts without edits, from `install` to `uninstall`, or within a ``with`` block.
 
     Optimizer steps count if a parameter group is named ``opacity`` or ``opacities``: other optimizers train networks,
-    poses or exposures.
+    poses or exposures. After each of them ``decay`` fades the logits of that group; its steps are the optimizer's own.
 
     It is an error if more than ``patience`` optimizer steps in a row have no regularized render, or if more than that
     many training steps in all have no render; 0 for no limit. ``tally`` counts what was done so far.
     """
 
-    def __init__(self, patience: int) -> None:
+    def __init__(self, patience: int, decay: OpacityDecay | None = None) -> None:
         check_count(patience, "patience", minimum=0)
         self.tally = Tally()
+        self._decay = decay
+        self._steps: MutableMapping[Optimizer, int] = WeakKeyDictionary()
         self._patience = patience
         self._optimized = self._idle = 0  # optimizer steps: all, and those since the last regularized render
         self._handle: Any = None
@@ -120,9 +128,15 @@ class Hook(abc.ABC):
         return self.tally.used or self._optimized > 0
 
     def problem(self) -> str | None:
-        """Describe a failure to regularize and its remedy; None if there was none, and with a patience of 0."""
-        shortfall = self._patience and self.tally.shortfall(self._optimized)
-        return f"{shortfall} {self._explain()}" if shortfall else None
+        """Describe a failure to regularize, or to decay, and its remedy; else None. A patience of 0 takes any."""
+        if shortfall := self._patience and self.tally.shortfall(self._optimized):
+            return f"{shortfall} {self._explain()}"
+        if self._decay is not None and self._patience and self.tally.regularized and not self._optimized:
+            return (
+                "Opacities did not decay: no optimizer has a parameter group that is named opacity or opacities. Call "
+                "ca_reg.OpacityDecay in the script, after its optimizer's step."
+            )
+        return None
 
     def __enter__(self) -> Self:
         """Install the hook unless it is installed."""
@@ -156,10 +170,16 @@ class Hook(abc.ABC):
             self._handle = None
 
     def _stepped(self, optimizer: Optimizer, args: Any, kwargs: Any) -> None:
-        if any(group.get("name") in _NAMES for group in optimizer.param_groups):
+        of_opacities = [group for group in optimizer.param_groups if group.get("name") in _NAMES]
+        if of_opacities:
             self._optimized += 1
             self._idle += 1
             self._check(self._idle, "optimizer steps of the Gaussians in a row, and no render was regularized")
+            if self._decay is not None:
+                self._steps[optimizer] = step = self._steps.get(optimizer, 0) + 1
+                for logits in (x for group in of_opacities for x in group["params"]):
+                    self._decay(logits, step)
+                self.tally.decayed += step > self._decay.start
 
     def _check(self, count: int, what: str) -> None:
         if 0 < self._patience < count:

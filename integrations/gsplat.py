@@ -23,6 +23,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
+from ca_reg import OpacityDecay
 from ca_reg._random import seeded
 
 from ._calls import Call, Signature, chain_of
@@ -208,9 +209,9 @@ class Installation(Hook):
 
     def __init__(
         self, regularizer: nn.Module, *, generator: torch.Generator | None = None, seed: int | None = None,
-        patience: int = 100,
+        patience: int = 100, decay: OpacityDecay | None = None,
     ) -> None:  # fmt: skip
-        super().__init__(patience)
+        super().__init__(patience, decay)
         self.functions: dict[str, Regularized] = {}
         self.steps = itertools.count()
         self._regularizer, self._generator, self._seed = regularizer, generator, seed
@@ -263,7 +264,10 @@ class Installation(Hook):
         )
 
 
-def install(regularizer: nn.Module, *, generator: torch.Generator | None = None, patience: int = 100) -> Installation:
+def install(
+    regularizer: nn.Module, *, generator: torch.Generator | None = None, patience: int = 100,
+    decay: OpacityDecay | None = None,
+) -> Installation:  # fmt: skip
     """Replace gsplat's functions for scripts that are not edited.
 
     These are the functions named ``rasterization...`` that take opacities, 2DGS included, in ``gsplat`` and in
@@ -272,7 +276,8 @@ def install(regularizer: nn.Module, *, generator: torch.Generator | None = None,
 
     Arguments and errors are those of :func:`regularized`, besides an ImportError if gsplat is missing and a ValueError
     if it is installed already. More than ``patience`` steps in a row, of optimizers with a parameter group ``opacity``
-    or ``opacities``, without a regularized call end the training in a RuntimeError; 0 for no limit.
+    or ``opacities``, without a regularized call end the training in a RuntimeError; 0 for no limit. After each of these
+    steps ``decay`` fades the opacities, whose logits the group holds.
 
     Example:
         >>> import runpy
@@ -282,7 +287,7 @@ def install(regularizer: nn.Module, *, generator: torch.Generator | None = None,
         >>> installation.tally.regularized  # doctest: +SKIP
         30000
     """
-    return Installation(regularizer, generator=generator, patience=patience).install()
+    return Installation(regularizer, generator=generator, patience=patience, decay=decay).install()
 
 
 def load_gsplat(device: torch.device | None = None) -> Any:

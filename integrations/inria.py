@@ -15,6 +15,7 @@ from typing import Any, Literal, Self, get_args
 import torch
 from torch import Tensor, nn
 
+from ca_reg import OpacityDecay
 from ca_reg._check import check_count
 from ca_reg._random import seeded, split_mix
 from ca_reg.chain import WrappedModule
@@ -76,6 +77,8 @@ class RasterizerHook(Hook):
         patience: number of optimizer steps of Gaussians in a row without a regularized render, and total number of
             training steps without a render, beyond which an error is raised; 0 for no limit.
         allow_zeros: accept exact zeros among the incoming opacities, by default taken for the code base's own dropout.
+        decay: fades the opacities after each step of an optimizer with a parameter group ``opacity``; the group holds
+            their logits.
 
     Raises:
         TypeError: if ``regularizer`` is not a module or takes no ``generator``.
@@ -108,8 +111,9 @@ class RasterizerHook(Hook):
         viewer: str | None = "MiniCam",
         patience: int = 100,
         allow_zeros: bool = False,
+        decay: OpacityDecay | None = None,
     ) -> None:
-        super().__init__(patience)
+        super().__init__(patience, decay)
         for name, value, choices in (("scope", scope, get_args(Scope)), ("steps", steps, get_args(Steps))):
             if value not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}.")

@@ -26,7 +26,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
 
-from ca_reg import Chain, GaussianDropout, OpacityNoise
+from ca_reg import Chain, GaussianDropout, OpacityDecay, OpacityNoise
 from ca_reg.regularizers import parse
 from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
@@ -50,7 +50,10 @@ from .inria import DEFAULT_MODEL, RasterizerHook, Scope, Steps
 __all__ = ["main"]
 
 _OF_INRIA = ("scope", "rasterizer", "outputs", "steps", "viewer", "allow_zeros")  # do not apply to gsplat's scripts
-_REPORTED = ("script", "arguments", "regularizer", "dropout", "noise", "start", "ramp", "scope", "seed", "cpu")
+_REPORTED = (
+    "script", "arguments", "regularizer", "dropout", "noise", "start", "ramp", "opacity_decay", "decay_start", "scope",
+    "seed", "cpu",
+)  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -153,6 +156,10 @@ def parse_options(arguments: Sequence[str] | None, *, in_child: bool = False) ->
     add("--noise", type=float, metavar="SIGMA", help="standard deviation of the relative opacity noise, e.g. 0.8")
     add("--start", type=int, default=0, metavar="STEP", help="first step with --dropout and --noise (default: 0)")
     add("--ramp", type=int, metavar="STEPS", help="raise both rates linearly from 0 over so many steps after --start")
+    add("--opacity-decay", type=float, metavar="FACTOR", help="multiply all opacities by this after every optimizer "
+        "step, e.g. 0.995")  # fmt: skip
+    add("--decay-start", type=int, default=500, metavar="STEP", help="step after which --opacity-decay begins, best "
+        "where density control does (default: 500)")  # fmt: skip
     add("--scope", choices=get_args(Scope), default="main", help="a step's first training render and its batch, or all")
     add("--seed", type=int, default=0, help="of masks and noise (default: 0); the script's random numbers are its own")
     add("--guard", type=Path, metavar="SCENE", help="afterwards write the last .ply again, as *_clean.ply, without "
@@ -215,8 +222,9 @@ def parse_options(arguments: Sequence[str] | None, *, in_child: bool = False) ->
         options.hook = _hook(options)
     except (TypeError, ValueError) as error:
         parser.error(str(error))
-    if options.guard is not None and options.hook is None:
-        parser.error("--guard is for what --dropout, --noise or --regularizer leave: a plain model needs all it has")
+    if options.hook is None and (options.guard is not None or options.opacity_decay is not None):
+        name = "--guard" if options.guard is not None else "--opacity-decay"
+        parser.error(f"{name} is for what --dropout, --noise or --regularizer leave: a plain model needs all it has")
     return options
 
 
@@ -233,10 +241,13 @@ def _hook(options: argparse.Namespace) -> Hook | None:
         if rate is not None:
             kind(rate)  # checks the rate, which a schedule does only at each step
             members.append(kind(scheduled(rate)))
+    decay = None
+    if options.opacity_decay is not None:
+        decay = OpacityDecay(options.opacity_decay, start=options.decay_start)
     if not members:
         return None
     if options.gsplat:
-        return Installation(Chain(*members), seed=options.seed, patience=options.patience)
+        return Installation(Chain(*members), seed=options.seed, patience=options.patience, decay=decay)
     return RasterizerHook(
         Chain(*members),
         scope=options.scope,
@@ -248,6 +259,7 @@ def _hook(options: argparse.Namespace) -> Hook | None:
         viewer=None if options.viewer == "none" else options.viewer,
         patience=options.patience,
         allow_zeros=options.allow_zeros,
+        decay=decay,
     )
 
 

@@ -18,6 +18,7 @@ from ca_reg.functional.multipliers import Multiplier
 from ca_reg.functional.opacities import (
     apply_dropout,
     apply_opacity_noise,
+    decayed_logits,
     draw_keep_mask,
     draw_opacity_noise,
     expected_opacity,
@@ -29,7 +30,7 @@ from ca_reg.functional.variance import ColorVariance, color_variance
 
 __all__ = [
     "ColorVariance", "Multiplier", "PixelMoments", "alpha_moments", "apply_dropout", "apply_opacity_noise",
-    "color_variance", "contributions", "draw_keep_mask", "draw_numbers", "draw_opacity_noise",
+    "color_variance", "contributions", "decayed_logits", "draw_keep_mask", "draw_numbers", "draw_opacity_noise",
     "expected_absolute_error", "expected_opacity", "expected_squared_error", "first_order_variance",
     "gaussian_dropout", "neutral_background", "opacity_noise", "pixel_moments", "scale_opacity",
 ]  # fmt: skip

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from ca_reg._check import (
     Rate,
     check_count,
+    check_factor,
     check_finite,
     check_opacity,
     check_opacity_range,
     check_per_gaussian,
     check_rates,
     check_sigma,
+    check_tensor,
     is_zero,
     rate_like,
 )
@@ -21,9 +25,12 @@ from ca_reg._random import draw_numbers
 from ca_reg.functional.multipliers import Multiplier
 
 __all__ = [
-    "apply_dropout", "apply_opacity_noise", "draw_keep_mask", "draw_opacity_noise", "expected_opacity",
-    "gaussian_dropout", "opacity_noise", "scale_opacity",
+    "apply_dropout", "apply_opacity_noise", "decayed_logits", "draw_keep_mask", "draw_opacity_noise",
+    "expected_opacity", "gaussian_dropout", "opacity_noise", "scale_opacity",
 ]  # fmt: skip
+
+FAINTEST = -16.0
+"""The smallest logit that decay leaves, of an opacity of 1e-7."""
 
 
 def draw_keep_mask(
@@ -256,3 +263,32 @@ def expected_opacity(opacity: Tensor, sigma: float, *, clip: bool = False) -> Te
     check_opacity_range(opacity)
     check_finite(sigma, "sigma", minimum=0.0)
     return opacity if sigma == 0 else opacity * Multiplier.clamped_noise(opacity, sigma, clip=clip).mean
+
+
+def decayed_logits(logits: Tensor, factor: float) -> Tensor:
+    """Return the logits of opacities that are multiplied by a factor, ``logit(factor * sigmoid(logits))``.
+
+    Args:
+        logits: the trained parameter whose sigmoid is the opacity, of any shape and floating-point type.
+        factor: in (0, 1].
+
+    Returns:
+        A new tensor. What has faded to a logit of -16, an opacity of 1e-7, stays there, or it would be exactly 0 later.
+
+    Raises:
+        TypeError: if the logits are no floating-point tensor, or the factor is no number.
+        ValueError: if the factor is outside (0, 1].
+
+    Example:
+        >>> decayed_logits(torch.tensor([0.0, 3.0]), 0.5).sigmoid()
+        tensor([0.2500, 0.4763])
+    """
+    check_tensor(logits, "logits", "give the parameter whose sigmoid is the opacity")
+    if not logits.is_floating_point():
+        raise TypeError(f"logits must be a floating-point tensor, got {logits.dtype}.")
+    check_factor(factor)
+    if factor == 1:
+        return logits.clone()
+    # f s / (1 - f s) = f / ((1 - f) + e^-x) for s = sigmoid(x): neither overflows nor cancels.
+    rest = logits.new_full((), math.log1p(-factor))
+    return (math.log(factor) - torch.logaddexp(rest, -logits)).clamp(min=FAINTEST)

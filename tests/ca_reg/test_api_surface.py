@@ -12,8 +12,8 @@ import pytest
 import ca_reg
 
 EXPECTED = [
-    "GaussianDropout", "OpacityNoise", "Chain", "CAScore", "CAResult", "Reason", "CAMonitor", "CAPenalty", "attribute",
-    "error_map", "ErrorMap",
+    "GaussianDropout", "OpacityNoise", "Chain", "OpacityDecay", "CAScore", "CAResult", "Reason", "CAMonitor",
+    "CAPenalty", "attribute", "error_map", "ErrorMap",
     "IndependentDropout", "Regularizer", "Params", "Draw", "scale_opacity", "expected_opacity", "__version__",
 ]  # fmt: skip
 ELSEWHERE = {
@@ -36,6 +36,7 @@ FUNCTIONAL = {
     "color_variance",
     "expected_opacity",
     "contributions",
+    "decayed_logits",
     "draw_keep_mask",
     "draw_numbers",
     "draw_opacity_noise",

@@ -8,7 +8,7 @@ import pytest
 import torch
 from stand_ins.gsplat import activated, rasterization, rasterization_that_culls_nothing, rasterization_without_radii
 
-from ca_reg import GaussianDropout
+from ca_reg import GaussianDropout, OpacityDecay
 from ca_reg.integrations._report import Skip
 from ca_reg.integrations.gsplat import Installation, install
 from ca_reg.schedules import StartStop
@@ -84,6 +84,19 @@ def test_a_training_past_the_installation_is_an_error(fake_gsplat, params, camer
     ):
         train()
     assert made == 2
+
+
+def test_opacities_decay_after_their_own_optimizers_steps(fake_gsplat, params, cameras):
+    before = {name: x.detach().clone() for name, x in params.items()}
+    optimizers = [torch.optim.SGD([{"params": [x], "name": name}], lr=0.0) for name, x in params.items()]
+    with install(GaussianDropout(0.5), decay=OpacityDecay(0.9, start=1)):
+        for _ in range(3):
+            fake_gsplat.rasterization(**activated(params), **cameras)[0].sum().backward()
+            for optimizer in optimizers:
+                optimizer.step()
+    after = params["opacities"].detach().sigmoid()
+    torch.testing.assert_close(after, 0.81 * before.pop("opacities").sigmoid(), rtol=1e-5, atol=0)
+    assert all(torch.equal(params[name], x) for name, x in before.items())
 
 
 def test_a_block_installs_what_is_not(fake_gsplat):

@@ -13,7 +13,7 @@ from stand_ins.card import counted_synchronizations, pretended_card
 from stand_ins.inria import PIPE, Model, make_rasterizer, make_render, rasterize
 from torch import nn
 
-from ca_reg import GaussianDropout, OpacityNoise
+from ca_reg import GaussianDropout, OpacityDecay, OpacityNoise
 from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.schedules import LinearRamp, StartStop
 
@@ -354,3 +354,36 @@ def test_the_steps_of_a_network_beside_the_gaussians_are_not_theirs(rasterizer, 
             render(model.camera, model, PIPE, BLACK)
             assert network.update_learning_rate(step) == step
     assert (hook.tally.regularized, hook.tally.lost) == (4, 0)
+
+
+def test_opacities_decay_after_the_steps_of_every_model(rasterizer):
+    """Also with the new parameters of a densification; whatever else is trained stays."""
+    models = Model(), Model()
+    optimizers = [optimizer_of(model) for model in models]
+    for group in (group for optimizer in optimizers for group in optimizer.param_groups):
+        group["lr"] = 0.0
+    before = [x.detach().clone() for x in models[0].parameters()]
+    render = make_render(rasterizer)
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, decay=OpacityDecay(0.9, start=1)) as hook:
+        for step in (1, 2, 3):
+            hook.step(step)
+            for model, optimizer in zip(models, optimizers, strict=True):
+                train(model, render, optimizer)
+            densify(models[0], optimizers[0])
+    for model in models:
+        for x, start in zip(model.parameters(), before, strict=True):
+            if x is model._opacity:
+                torch.testing.assert_close(x.detach().sigmoid(), 0.81 * start.sigmoid(), rtol=1e-5, atol=0)
+            else:
+                assert torch.equal(x, start)
+    assert "opacities decayed after 4 optimizer steps" in hook.tally.lines()
+
+
+def test_a_decay_that_finds_no_opacities_is_an_error(rasterizer):
+    model = Model()
+    optimizer = optimizer_of(model, name="mine")
+    hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, decay=OpacityDecay()).install()
+    hook.step(1)
+    train(model, make_render(rasterizer), optimizer)
+    hook.uninstall()
+    assert re.search("did not decay.*named opacity", hook.problem())

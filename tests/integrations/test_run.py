@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import textwrap
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
@@ -46,6 +47,7 @@ def test_a_script_is_regularized_and_the_report_says_how(repository, tmp_path, c
         "first_step": 2,
         "last_step": 3,
         "lost": 0,
+        "decayed": 0,
     }
     assert (written["dropout"], written["arguments"], written["ended"]) == (0.5, ["3"], "exit 0")
     assert "[ca_reg] 2 renders regularized, steps 2 to 3" in regularized.err
@@ -54,6 +56,34 @@ def test_a_script_is_regularized_and_the_report_says_how(repository, tmp_path, c
     assert after[0] == before[0]
     assert all(a < 0.8 * b for a, b in zip(after[1:], before[1:], strict=True))
     assert draws(plain.out) == draws(regularized.out)  # the script's own random numbers
+
+
+def test_the_opacities_of_a_script_decay(repository, tmp_path, capsys):
+    script, report = repository / "decaying.py", tmp_path / "report.json"
+    text = """
+        import torch
+        from gaussian_renderer import render
+        from scene import GaussianModel
+
+        gaussians = GaussianModel()
+        before = gaussians.get_opacity.detach().clone()
+        optimizer = torch.optim.SGD([{"params": [gaussians._opacity], "name": "opacity"}], lr=0.0)
+        for iteration in range(1, 5):
+            gaussians.update_learning_rate(iteration)
+            render(gaussians.camera, gaussians, None, torch.zeros(3))["render"].sum().backward()
+            optimizer.step()
+        print("ratios", *(gaussians.get_opacity / before).flatten().tolist())
+    """
+    script.write_text(textwrap.dedent(text))
+    decaying = ["--opacity-decay", "0.9", "--decay-start", "1"]
+    main(["--dropout", "0.5", *decaying, "--report", str(report), str(script)])
+    out, err = capsys.readouterr()
+    assert [float(x) for x in out.split("ratios")[1].split()] == pytest.approx(
+        [0.9**3] * len(out.split()[1:]), rel=1e-5
+    )
+    assert "opacities decayed after 3 optimizer steps" in err
+    written = json.loads(report.read_text())
+    assert (written["opacity_decay"], written["decay_start"], written["renders"]["decayed"]) == (0.9, 1, 3)
 
 
 def test_a_users_own_regularizer_from_the_present_folder(repository, my_module, tmp_path, capsys):
@@ -298,6 +328,7 @@ def test_a_script_that_calls_gsplat_is_told_from_the_others(tmp_path, capsys, re
         "first_step": 0,
         "last_step": 2,
         "lost": 0,
+        "decayed": 0,
     }
     assert all(a < 0.8 * b for a, b in zip(seen(regularized.out), seen(plain), strict=True))
     assert draws(plain) == draws(regularized.out)
@@ -344,7 +375,10 @@ def test_an_installed_command_is_a_script_as_well(tmp_path, monkeypatch):
         (["--outputs", "2", "SCRIPT"], "which --cpu asks for"),
         (["--report", "nowhere/x.json", "SCRIPT"], "there is no folder"),
         (["--dropout", "0.2", "--guard", "nowhere", "SCRIPT"], "there is no scene .*nowhere for --guard"),
-        (["--guard", ".", "SCRIPT"], "a plain model needs all it has"),
+        (["--guard", ".", "SCRIPT"], "--guard is .* a plain model needs all it has"),
+        (["--opacity-decay", "0.995", "SCRIPT"], "--opacity-decay is .* a plain model needs all it has"),
+        (["--dropout", "0.2", "--opacity-decay", "1.5", "SCRIPT"], r"factor must be in \(0, 1\]"),
+        (["--dropout", "0.2", "--opacity-decay", "0.9", "--decay-start", "-1", "SCRIPT"], "start must be at least 0"),
         (["--drop", "0.2", "SCRIPT"], "unrecognized arguments|no script"),
     ],
 )

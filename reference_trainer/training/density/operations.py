@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ca_reg.functional import decayed_logits
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.render.engine import engine_for
 from reference_trainer.rotations import rotation_matrices
@@ -159,6 +160,4 @@ def reset_opacity(optimizer: GaussianOptimizer, ceiling: float) -> None:
 
 def decay_opacity(optimizer: GaussianOptimizer, factor: float) -> None:
     """Multiply every opacity by ``factor`` (Binocular3DGS's opacity decay); the optimizer state stays."""
-    opacities = optimizer.gaussians.opacities.detach() * factor
-    # The floor keeps the logit finite; a Gaussian this faint is pruned long before.
-    optimizer.set_opacity_logits(torch.logit(opacities.clamp(min=1e-7)))
+    optimizer.set_opacity_logits(decayed_logits(optimizer.gaussians.opacity_logits.detach(), factor))
