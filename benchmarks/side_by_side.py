@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.paper.rows import Row, Rows
 from reference_trainer.evaluation.results import machine
+from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.depth import point_prior
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import Scene
@@ -172,8 +173,19 @@ for recipe, (fork, theirs, ours) in _RECIPES.items():  # a recipe beside the rep
     )
 
 EXPORT = "ca_reg.integrations.run --cpu ns-export gaussian-splat --load-config {config} --output-dir {out}/export"
-EVALUATE = "reference_trainer.cli evaluate {ply} --scene {scene} --images {images} --out {out}/evaluation {scaled}"
-OPTIONS = {"plain": "", "dropout": "--dropout 0.2", "noise": "--noise 0.8"}
+EVALUATE = (
+    "reference_trainer.cli evaluate {ply} --scene {scene} --images {images} --split {split} {smaller} "
+    "--out {out}/evaluation {scaled}"
+)
+OPTIONS = {
+    "plain": "", "dropout": "--dropout 0.2", "noise": "--noise 0.8", "decay": "--dropout 0.2 --opacity-decay 0.995",
+}  # fmt: skip
+FEW = "3DGS as it is"
+"""3DGS with all settings of its own but for the number of iterations, over which positions slow down."""
+TRAINERS[FEW] = (
+    f"{_LAUNCHED}{{forks}}/3DGS/train.py -s {{fork_scene}} -m {{out}} -r 1 --iterations {{n}} "
+    f"--position_lr_max_steps {{n}} --save_iterations {{n}} --test_iterations {_NEVER} --port 0"
+)
 
 
 def settings(trainer: str) -> Sequence[str]:
@@ -182,7 +194,11 @@ def settings(trainer: str) -> Sequence[str]:
         return ["dropout"]
     if ": " in trainer:
         return ["plain"]
-    return ["plain", "noise"] if trainer == "DropGaussian" else list(OPTIONS)  # which refuses a second dropout
+    if trainer == FEW:
+        return ["plain", "dropout", "decay"]
+    return (
+        ["plain", "noise"] if trainer == "DropGaussian" else ["plain", "dropout", "noise"]
+    )  # it refuses a second dropout
 
 
 def named(trainer: str, setting: str) -> dict[str, str]:
@@ -207,7 +223,8 @@ def train(trainer: str, setting: str, seed: int, out: Path, args: argparse.Names
     environment = os.environ | {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}  # nerfstudio loads its checkpoints as pickles
     environment["PYTHONPATH"] = os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])
     names = vars(args) | steps(args.iterations) | {"out": out, "seed": seed, "option": OPTIONS[setting]}
-    names["scaled"] = "--regularizer dropout(0.2)" if setting == "dropout" else ""
+    names["scaled"] = "" if setting in ("plain", "noise") else "--regularizer dropout(0.2)"
+    names["smaller"] = "" if args.downscale is None else f"--downscale {args.downscale}"
 
     def call(command: str, python: str = sys.executable, **further: object) -> float:
         timed = [python, str(_TIMED), str(out / "times.json"), str(seed)]
@@ -243,6 +260,9 @@ def main() -> None:
     add("file", type=Path)
     add("--scene", type=_path, required=True)
     add("--images", default="images")
+    add("--split", default="auto")
+    add("--points", default="auto")
+    add("--downscale", type=float)
     add("--forks", type=_path, default=_path("forks"), help="where the repositories lie")
     add("--both", type=_path, help="for gsplat and nerfstudio: a COLMAP folder of the training and test photographs")
     add("--trainers", choices=TRAINERS, nargs="+", required=True)
@@ -253,7 +273,8 @@ def main() -> None:
     args = parser.parse_args()
     args.fork_scene = args.out / "llff"  # CoR-GS tells its readers by the path
     if not (args.fork_scene / "poses_bounds.npy").is_file():
-        write_scene(SceneOptions(str(args.scene), images=args.images).load(), args.fork_scene)
+        options = {name: getattr(args, name) for name in ("images", "split", "points", "downscale")}
+        write_scene(load_scene(SceneOptions(str(args.scene), allow_test_points=True, **options)), args.fork_scene)
     rows = Rows(args.file, {"scene": args.scene.name, "iterations": args.iterations, "machine": machine(), "usual": {}})
     for seed in args.seeds:
         for trainer in args.trainers:
