@@ -110,6 +110,7 @@ def test_another_interpreter_may_evaluate(tmp_path, monkeypatch):
 
     monkeypatch.setattr(side_by_side.subprocess, "run", run)
     given = {"scene": "fern", "images": "images", "both": "both", "iterations": 5, "evaluator": "evaluating"}
+    given |= {"split": "auto", "downscale": None}
     row = side_by_side.train("splatfacto-ca", "dropout", 2, tmp_path, argparse.Namespace(**given))
     assert called == [
         (sys.executable, "ca_reg.integrations.run", "--cpu"),
