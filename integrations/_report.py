@@ -13,8 +13,8 @@ from weakref import WeakKeyDictionary
 
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 
-from ca_reg import OpacityDecay
 from ca_reg._check import check_count
+from ca_reg.decay import OpacityDecay
 
 
 class Skip(StrEnum):
@@ -134,7 +134,7 @@ class Hook(abc.ABC):
         if self._decay is not None and self._patience and self.tally.regularized and not self._optimized:
             return (
                 "Opacities did not decay: no optimizer has a parameter group that is named opacity or opacities. Call "
-                "ca_reg.OpacityDecay in the script, after its optimizer's step."
+                "ca_reg.decay.OpacityDecay in the script, after its optimizer's step."
             )
         return None
 

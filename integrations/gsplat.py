@@ -23,8 +23,8 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from ca_reg import OpacityDecay
 from ca_reg._random import seeded
+from ca_reg.decay import OpacityDecay
 
 from ._calls import Call, Signature, chain_of
 from ._report import Hook, Tally

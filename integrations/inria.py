@@ -15,10 +15,10 @@ from typing import Any, Literal, Self, get_args
 import torch
 from torch import Tensor, nn
 
-from ca_reg import OpacityDecay
 from ca_reg._check import check_count
 from ca_reg._random import seeded, split_mix
 from ca_reg.chain import WrappedModule
+from ca_reg.decay import OpacityDecay
 from ca_reg.types import RenderFn, Rendering, read_rendering
 
 from ._calls import (

@@ -26,7 +26,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
 
-from ca_reg import Chain, GaussianDropout, OpacityDecay, OpacityNoise
+from ca_reg import Chain, GaussianDropout, OpacityNoise
+from ca_reg.decay import OpacityDecay
 from ca_reg.regularizers import parse
 from ca_reg.schedules import LinearRamp, Schedule, StartStop
 

@@ -12,12 +12,13 @@ import pytest
 import ca_reg
 
 EXPECTED = [
-    "GaussianDropout", "OpacityNoise", "Chain", "OpacityDecay", "CAScore", "CAResult", "Reason", "CAMonitor",
-    "CAPenalty", "attribute", "error_map", "ErrorMap",
+    "GaussianDropout", "OpacityNoise", "Chain", "CAScore", "CAResult", "Reason", "CAMonitor", "CAPenalty", "attribute",
+    "error_map", "ErrorMap",
     "IndependentDropout", "Regularizer", "Params", "Draw", "scale_opacity", "expected_opacity", "__version__",
 ]  # fmt: skip
 ELSEWHERE = {
     "attribution": {"CAAttribution", "CATotalEffects", "SharesFn", "attribute", "total_effects"},
+    "decay": {"OpacityDecay"},
     "functional": {"ColorVariance", "Multiplier", "color_variance"},
     "lists": {"ListMoments", "PixelLists"},
     "monitor": {"LOG_NAME", "CAMonitor", "plot_dynamics", "read_dynamics"},

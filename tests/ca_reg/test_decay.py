@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from ca_reg import OpacityDecay
+from ca_reg.decay import OpacityDecay
 from ca_reg.functional import decayed_logits
 
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 from stand_ins.gsplat import activated, rasterization, rasterization_that_culls_nothing, rasterization_without_radii
 
-from ca_reg import GaussianDropout, OpacityDecay
+from ca_reg import GaussianDropout
+from ca_reg.decay import OpacityDecay
 from ca_reg.integrations._report import Skip
 from ca_reg.integrations.gsplat import Installation, install
 from ca_reg.schedules import StartStop

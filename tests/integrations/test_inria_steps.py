@@ -13,7 +13,8 @@ from stand_ins.card import counted_synchronizations, pretended_card
 from stand_ins.inria import PIPE, Model, make_rasterizer, make_render, rasterize
 from torch import nn
 
-from ca_reg import GaussianDropout, OpacityDecay, OpacityNoise
+from ca_reg import GaussianDropout, OpacityNoise
+from ca_reg.decay import OpacityDecay
 from ca_reg.integrations.inria import RasterizerHook
 from ca_reg.schedules import LinearRamp, StartStop
 
