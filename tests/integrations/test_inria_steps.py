@@ -373,11 +373,11 @@ def test_opacities_decay_after_the_steps_of_every_model(rasterizer):
             densify(models[0], optimizers[0])
     for model in models:
         for x, start in zip(model.parameters(), before, strict=True):
-            if x is model._opacity:
+            if x.shape[1:] == (1,):
                 torch.testing.assert_close(x.detach().sigmoid(), 0.81 * start.sigmoid(), rtol=1e-5, atol=0)
             else:
                 assert torch.equal(x, start)
-    assert "opacities decayed after 4 optimizer steps" in hook.tally.lines()
+    assert hook.tally.decayed == 4
 
 
 def test_a_decay_that_finds_no_opacities_is_an_error(rasterizer):
@@ -387,4 +387,4 @@ def test_a_decay_that_finds_no_opacities_is_an_error(rasterizer):
     hook.step(1)
     train(model, make_render(rasterizer), optimizer)
     hook.uninstall()
-    assert re.search("did not decay.*named opacity", hook.problem())
+    assert re.search("not decay.* named opacity", hook.problem())

@@ -81,7 +81,7 @@ def test_the_opacities_of_a_script_decay(repository, tmp_path, capsys):
     assert [float(x) for x in out.split("ratios")[1].split()] == pytest.approx(
         [0.9**3] * len(out.split()[1:]), rel=1e-5
     )
-    assert "opacities decayed after 3 optimizer steps" in err
+    assert "decayed after 3 optimizer steps" in err
     written = json.loads(report.read_text())
     assert (written["opacity_decay"], written["decay_start"], written["renders"]["decayed"]) == (0.9, 1, 3)
 
