@@ -7,6 +7,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -32,11 +33,15 @@ from reference_trainer.scenes.virtual_cameras import bounding_sphere, measured_v
 
 __all__ = [
     "ModelWithViews", "PlyFacts", "check_frame", "load_for_views", "load_plain_ply_model", "load_ply_model",
-    "log_other_frame", "scaled", "score_ply",
+    "log_other_center", "log_other_frame", "scaled", "score_ply",
 ]  # fmt: skip
 
 _log = logging.getLogger(__name__)
 
+CLEARLY = 1.0
+"""PSNR, dB, by which other cameras have to fit the training views better than their own."""
+NEARLY_MIDDLE = 0.1
+"""Pixels from the middle of the picture within which a principal point is taken to be there."""
 SMALLEST_RADIUS = 0.25
 """Smaller models are enlarged to this radius: the renderer's near plane, at 0.2, would cut into them."""
 
@@ -198,6 +203,7 @@ def score_ply(
         )
     else:
         log_other_frame(result, scene, ply)
+        log_other_center(loaded.model, scene, ply)
     return result
 
 
@@ -245,6 +251,29 @@ def log_other_frame(result: Evaluation, scene: Scene, ply: Path) -> None:
         _log.info(
             f"Every training view is further from its photograph than a picture of one color would be: {ply} is not "
             f"in the frame of {scene.name}, or not a model of it. The PSNR says nothing, CA is that of these views."
+        )
+
+
+def log_other_center(model: TrainedModel, scene: Scene, ply: Path) -> None:
+    """Log it if the model fits the training views better through the middle of the picture than through their centers.
+
+    That is where the INRIA code takes every principal point to be.
+    """
+    gains = list[float]()
+    for view in (view.to(model.background.device) for view in scene.train):
+        camera = view.camera
+        middle = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
+        if math.dist((camera.cx, camera.cy), (middle.cx, middle.cy)) < NEARLY_MIDDLE:
+            return
+        pictures = (model.test_rendering(replace(view, camera=each)).image for each in (camera, middle))
+        own, other = (psnr(picture.clamp(0, 1), view.image, view.mask) for picture in pictures)
+        gains.append(other - own)
+    if gains and min(gains) > 0 and fmean(gains) > CLEARLY:
+        _log.info(
+            f"The training views fit {fmean(gains):.1f} dB better through the middle of the picture than through the "
+            f"principal points of {scene.name}: {ply} is of a trainer that takes no notice of them, as INRIA's, and "
+            "every view is measured beside its place. To measure it as it was trained, set cx and cy of the cameras to "
+            "half the width and height; to train it right, crop the photographs around their principal points."
         )
 
 

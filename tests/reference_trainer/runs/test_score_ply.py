@@ -12,11 +12,12 @@ from PIL import Image
 
 from reference_trainer.evaluation.metrics import psnr
 from reference_trainer.evaluation.results import ResultStore
+from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import BAKED_PLY, PLY
 from reference_trainer.runs.measure import load_run_model
-from reference_trainer.runs.ply import load_for_views, load_ply_model, score_ply
+from reference_trainer.runs.ply import load_for_views, load_ply_model, log_other_center, score_ply
 from reference_trainer.runs.run import save_for_viewers
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import OrbitOptions
@@ -264,6 +265,22 @@ def test_a_model_that_fits_no_photograph(tmp_path, photographs, request):
             score_ply(tmp_path / f"{name}.ply", options, tmp_path / name, samples=2)
     assert "of one color" in heard["wrong"][-1]
     assert not any("one color" in text for text in heard["right"])
+
+
+@pytest.mark.parametrize(("trained", "by", "told"), [("middle", 2, True), ("its own", 2, False), ("middle", 0, False)])
+def test_a_model_of_a_trainer_that_takes_no_notice_of_principal_points(options, trained, by, told):
+    scene = load_scene(options)
+    widths = torch.full((len(scene.points.positions),), 0.1)
+    clouds = Gaussians.from_points(scene.points.positions, scene.points.colors, widths, sh_degree=0, opacity=0.9)
+    model = TrainedModel(clouds, scene.background)
+    photographed = []
+    for view in scene.train:  # whose principal points are in the middle
+        moved = dataclasses.replace(view, camera=dataclasses.replace(view.camera, cx=view.camera.cx + by))
+        seen = model.test_rendering(moved if trained == "its own" else view)
+        photographed.append(dataclasses.replace(moved, image=seen.image.clamp(0, 1).round(decimals=2)))
+    with hearing() as said:
+        log_other_center(model, dataclasses.replace(scene, train=tuple(photographed)), "model.ply")
+    assert any("cx and cy" in text for text in said) == told
 
 
 def test_a_ply_in_another_frame_is_refused_before_anything_is_written(tmp_path, options):
