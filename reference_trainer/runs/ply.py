@@ -265,8 +265,8 @@ def log_other_center(model: TrainedModel, scene: Scene, ply: Path) -> None:
         middle = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
         if math.dist((camera.cx, camera.cy), (middle.cx, middle.cy)) < NEARLY_MIDDLE:
             return
-        pictures = (model.test_rendering(replace(view, camera=each)).image for each in (camera, middle))
-        own, other = (psnr(picture.clamp(0, 1), view.image, view.mask) for picture in pictures)
+        images = (model.test_rendering(replace(view, camera=each)).image.clamp(0, 1) for each in (camera, middle))
+        own, other = (psnr(image, view.image, view.mask) for image in images)
         gains.append(other - own)
     if gains and min(gains) > 0 and fmean(gains) > CLEARLY:
         _log.info(
