@@ -89,6 +89,10 @@ class Tally:
 
 
 _NAMES = ("opacity", "opacities")  # parameter groups in the INRIA family and in gsplat's trainers
+_UNDECAYED = (
+    "Opacities do not decay: no optimizer has a parameter group that is named opacity or opacities. Leave out "
+    "--opacity-decay, and call ca_reg.decay.OpacityDecay in the script, after its optimizer's step."
+)
 
 
 class Hook(abc.ABC):
@@ -131,12 +135,8 @@ class Hook(abc.ABC):
         """Describe a failure to regularize, or to decay, and its remedy; else None. A patience of 0 takes any."""
         if shortfall := self._patience and self.tally.shortfall(self._optimized):
             return f"{shortfall} {self._explain()}"
-        if self._decay is not None and self._patience and self.tally.regularized and not self._optimized:
-            return (
-                "Opacities did not decay: no optimizer has a parameter group that is named opacity or opacities. Call "
-                "ca_reg.decay.OpacityDecay in the script, after its optimizer's step."
-            )
-        return None
+        undecayed = self._decay is not None and self.tally.regularized > 0 and not self._optimized
+        return _UNDECAYED if self._patience and undecayed else None
 
     def __enter__(self) -> Self:
         """Install the hook unless it is installed."""
@@ -151,8 +151,10 @@ class Hook(abc.ABC):
             raise RuntimeError(problem)
 
     def note_regularized(self) -> None:
-        """Record a training render that was regularized, or whose scheduled rate is 0."""
+        """Record a training render that was regularized, or whose rate is 0; RuntimeError if nothing can decay."""
         self._idle = 0
+        if self._decay is not None and not self._optimized and 0 < self._patience < self.tally.regularized:
+            raise RuntimeError(_UNDECAYED)
 
     def note_lost(self) -> None:
         """Record a training step without a render; raise RuntimeError if there are too many."""

@@ -383,8 +383,12 @@ def test_opacities_decay_after_the_steps_of_every_model(rasterizer):
 def test_a_decay_that_finds_no_opacities_is_an_error(rasterizer):
     model = Model()
     optimizer = optimizer_of(model, name="mine")
-    hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, decay=OpacityDecay()).install()
-    hook.step(1)
-    train(model, make_render(rasterizer), optimizer)
-    hook.uninstall()
+    hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, decay=OpacityDecay(), patience=2).install()
+    for step in (1, 2):
+        hook.step(step)
+        train(model, make_render(rasterizer), optimizer)
     assert re.search("not decay.* named opacity", hook.problem())
+    hook.step(3)
+    with pytest.raises(RuntimeError, match=r"not decay.* named opacity"):
+        train(model, make_render(rasterizer), optimizer)
+    hook.uninstall()
