@@ -39,28 +39,9 @@ from benchmarks.start_scenes import from_dense, from_today
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
-    "BESIDE_BINOCULAR",
-    "BESIDE_DROPOUT",
-    "BESIDE_TWO",
-    "BY_DEFAULT",
-    "BY_TODAYS",
-    "CHOICES",
-    "DROPOUT_ALONE",
-    "ENSEMBLE",
-    "KINDS",
-    "PLAIN_ENSEMBLE",
-    "QUALITY",
-    "SHARPER",
-    "SHORTER",
-    "SLOWER_MEANS",
-    "TODAYS_BESIDE_BINOCULAR",
-    "WITHOUT",
-    "Choice",
-    "figures_of",
-    "from_same_start",
-    "gains_of",
-    "pairs_of",
-    "tables",
+    "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_DEFAULT", "BY_TODAYS", "CHOICES", "DROPOUT_ALONE",
+    "ENSEMBLE", "KINDS", "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER", "SLOWER_MEANS", "TODAYS_BESIDE_BINOCULAR",
+    "WITHOUT", "Choice", "figures_of", "from_same_start", "gains_of", "pairs_of", "tables",
 ]  # fmt: skip
 
 

@@ -196,9 +196,9 @@ def settings(trainer: str) -> Sequence[str]:
         return ["plain"]
     if trainer == FEW:
         return ["plain", "dropout", "decay"]
-    return (
-        ["plain", "noise"] if trainer == "DropGaussian" else ["plain", "dropout", "noise"]
-    )  # it refuses a second dropout
+    if trainer == "DropGaussian":  # which refuses a second dropout
+        return ["plain", "noise"]
+    return ["plain", "dropout", "noise"]
 
 
 def named(trainer: str, setting: str) -> dict[str, str]:
