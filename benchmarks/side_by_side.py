@@ -201,9 +201,10 @@ def settings(trainer: str) -> Sequence[str]:
     return ["plain", "dropout", "noise"]
 
 
-def named(trainer: str, setting: str) -> dict[str, str]:
-    """Return what a row is of."""
-    return {"recipe": f"{trainer} {OPTIONS[setting]}".strip() if "{option}" in TRAINERS[trainer] else trainer}
+def named(trainer: str, setting: str, scene: str = "") -> dict[str, str]:
+    """Return what a row is of: with the name of the scene, where the file has rows of several."""
+    recipe = f"{trainer} {OPTIONS[setting]}".strip() if "{option}" in TRAINERS[trainer] else trainer
+    return {"recipe": recipe} | ({"scene": scene} if trainer == FEW else {})
 
 
 def steps(n: int) -> dict[str, int]:
@@ -245,7 +246,7 @@ def train(trainer: str, setting: str, seed: int, out: Path, args: argparse.Names
     test = {name: found["mean"]["test"][name] for name in ("psnr", "ssim", "ca", "ca_exact_half")}
     pace = seconds / (args.iterations - 1)
     return {
-        "setting": named(trainer, setting),
+        "setting": named(trainer, setting, Path(args.scene).name),
         "seed": seed,
         "test": test,
         "gaussians": found["gaussians"],
@@ -279,7 +280,7 @@ def main() -> None:
     for seed in args.seeds:
         for trainer in args.trainers:
             for setting in settings(trainer):
-                if seed not in rows.of(named(trainer, setting)):
+                if seed not in rows.of(named(trainer, setting, args.scene.name)):
                     out = args.out / trainer.replace(" ", "_").replace(":", "") / setting / str(seed)
                     shutil.rmtree(out, ignore_errors=True)
                     out.mkdir(parents=True)
