@@ -29,7 +29,8 @@ from reference_trainer.model.gaussians import SH_C0
 from reference_trainer.scenes import synthetic_scene
 
 README = ROOT / "README.md"
-PYTHON = dict(zip(("two lines", "chain", "gsplat", "score", "exact score"), blocks(README, "python"), strict=True))
+NAMES = "two lines", "a third", "chain", "gsplat", "score", "exact score"
+PYTHON = dict(zip(NAMES, blocks(README, "python"), strict=True))
 COMMANDS = [
     shlex.split(line, comments=True)
     for block in blocks(README, "bash")
@@ -61,6 +62,12 @@ def test_two_lines(gaussians):
     assert 0 < (found.radii == 0).sum() < 1000
     scaled = found.dropout.eval()(gaussians.get_opacity)
     assert torch.equal(scaled, torch.full((1000, 1), 0.4))
+
+
+def test_a_third_line():
+    gaussians = SimpleNamespace(_opacity=torch.nn.Parameter(torch.zeros(10, 1)))
+    run("a third", gaussians=gaussians, step=501)
+    torch.testing.assert_close(gaussians._opacity.sigmoid(), torch.full((10, 1), 0.4975))
 
 
 def test_the_chain_drops_and_leaves_the_global_random_state_alone(gaussians):
