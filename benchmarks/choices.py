@@ -40,8 +40,8 @@ from reference_trainer.evaluation.tables import format_mean_std, markdown_table,
 
 __all__ = [
     "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_DEFAULT", "BY_TODAYS", "CHOICES", "DROPOUT_ALONE",
-    "ENSEMBLE", "KINDS", "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER", "SLOWER_MEANS", "TODAYS_BESIDE_BINOCULAR",
-    "WITHOUT", "Choice", "figures_of", "from_same_start", "gains_of", "pairs_of", "tables",
+    "ENSEMBLE", "KINDS", "LEFT_OUT", "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER", "SLOWER_MEANS",
+    "TODAYS_BESIDE_BINOCULAR", "WITHOUT", "Choice", "figures_of", "from_same_start", "gains_of", "pairs_of", "tables",
 ]  # fmt: skip
 
 
@@ -146,6 +146,8 @@ QUALITY = {
 """What the twenty-second choice trained for `ca-reg run --quality`, in rows of photographs as they are kept."""
 WITHOUT = {"plain": "plain", TODAY: "recipe"} | {f"{TODAY} + {name}": name for name in _WITHOUT}
 """What the twenty-fourth leaves out, beside what it leaves it out of."""
+LEFT_OUT = tuple({TODAY: "recipe", f"{TODAY} + {name}": name} for name in _WITHOUT)
+"""The same, each held against the recipe."""
 _UNITS = {
     "held-out": ("held-out", 1.0),
     "psnr": ("test psnr", 1.0),
@@ -166,7 +168,8 @@ def tables(rows: Sequence[Row]) -> list[str]:
     if any(row["candidate"] == next(iter(QUALITY)) for row in rows):
         return [figures_of(rows, QUALITY, "{held-out:.2f} / {psnr:.2f}, {lpips:.3f}, {thousands:.0f}, {seconds:.0f} s")]
     gained = [gains_of(rows, choice) for choice in CHOICES.values()]
-    today = [from_same_start(rows, titles, from_today) for titles in (BY_DEFAULT, BY_TODAYS, TODAYS_BESIDE_BINOCULAR)]
+    of_today = (BY_DEFAULT, BY_TODAYS, TODAYS_BESIDE_BINOCULAR, *LEFT_OUT)
+    today = [from_same_start(rows, titles, from_today) for titles in of_today]
     without = figures_of(rows, WITHOUT, "{psnr:.2f}, {lpips:.3f}, {score:.2f}, {thousands:.0f}", (0,))
     return [*gained, *(from_same_start(rows, titles) for titles in _JUDGED), *today, without]
 

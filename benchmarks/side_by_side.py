@@ -180,9 +180,9 @@ EVALUATE = (
 OPTIONS = {
     "plain": "", "dropout": "--dropout 0.2", "noise": "--noise 0.8", "decay": "--dropout 0.2 --opacity-decay 0.995",
 }  # fmt: skip
-FEW = "3DGS as it is"
+AS_IT_IS = "3DGS as it is"
 """3DGS with all settings of its own but for the number of iterations, over which positions slow down."""
-TRAINERS[FEW] = (
+TRAINERS[AS_IT_IS] = (
     f"{_LAUNCHED}{{forks}}/3DGS/train.py -s {{fork_scene}} -m {{out}} -r 1 --iterations {{n}} "
     f"--position_lr_max_steps {{n}} --save_iterations {{n}} --test_iterations {_NEVER} --port 0"
 )
@@ -194,7 +194,7 @@ def settings(trainer: str) -> Sequence[str]:
         return ["dropout"]
     if ": " in trainer:
         return ["plain"]
-    if trainer == FEW:
+    if trainer == AS_IT_IS:
         return ["plain", "dropout", "decay"]
     if trainer == "DropGaussian":  # which refuses a second dropout
         return ["plain", "noise"]
@@ -204,7 +204,7 @@ def settings(trainer: str) -> Sequence[str]:
 def named(trainer: str, setting: str, scene: str = "") -> dict[str, str]:
     """Return what a row is of: with the name of the scene, where the file has rows of several."""
     recipe = f"{trainer} {OPTIONS[setting]}".strip() if "{option}" in TRAINERS[trainer] else trainer
-    return {"recipe": recipe} | ({"scene": scene} if trainer == FEW else {})
+    return {"recipe": recipe} | ({"scene": scene} if trainer == AS_IT_IS else {})
 
 
 def steps(n: int) -> dict[str, int]:
