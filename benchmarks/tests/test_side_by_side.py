@@ -9,11 +9,14 @@ import textwrap
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
 from benchmarks import side_by_side
 from benchmarks.timed import main
+from reference_trainer.scenes import load_scene
+from reference_trainer.scenes.options import SceneOptions
 
 
 def test_seeds_are_shifted_and_steps_are_timed(tmp_path, monkeypatch):
@@ -62,6 +65,25 @@ def test_what_is_kept_is_not_measured_again(tmp_path, monkeypatch):
     runs += [("DropGaussian", "noise"), ("3DGS", "plain"), ("3DGS", "dropout"), ("3DGS", "noise")]
     runs += [("splatfacto-ca", "dropout"), ("fsgs: FSGS", "plain")]
     assert asked == [(*run, seed) for seed in (0, 1) for run in runs]
+
+
+@pytest.mark.data
+def test_the_scene_of_the_repositories_has_the_training_views_and_the_points_alone(data_root, tmp_path, monkeypatch):
+    monkeypatch.setattr(side_by_side, "train", lambda *_: {"setting": {}, "seed": 0})
+    scene = ["--scene", str(data_root / "fern"), "--images", "images_16", "--split", "llff"]
+    scene += ["--points", "sparse_3views/0"]
+    command = ["", str(tmp_path / "rows.json"), *scene, "--out", str(tmp_path), "--trainers", "AbsGS", "--seeds", "0"]
+    monkeypatch.setattr(sys, "argv", command)
+    side_by_side.main()
+    again = load_scene(SceneOptions(str(tmp_path / "llff"), split="llff", test="none"), trains=False)
+    scene = load_scene(
+        SceneOptions(str(data_root / "fern"), images="images_16", split="llff", points="sparse_3views/0")
+    )
+    assert len(again.train) == len(scene.train) == 3
+    for written, view in zip(again.train, scene.train, strict=True):
+        torch.testing.assert_close(written.camera.world_to_camera, view.camera.world_to_camera, rtol=0, atol=1e-5)
+        torch.testing.assert_close(written.image, view.image, rtol=0, atol=0.5 / 255 + 1e-6)
+    torch.testing.assert_close(again.points.positions, scene.points.positions)
 
 
 def test_every_command_line_is_complete():
