@@ -4,19 +4,22 @@
         --forks forks --iterations 300 --trainers AbsGS MVGS
 
 ``forks`` has the repositories as folders of the names in `TRAINERS`; what they import, but for CUDA, is
-installed. Every run has a folder of its own below ``--out``; the file, of rows as of `benchmarks.paper`, is written
+installed. ``--evaluator`` is the interpreter of another environment, where nerfstudio and ca-reg need other versions
+of a package. Every run has a folder of its own below ``--out``; the file, of rows as of `benchmarks.paper`, is written
 after each, and none is repeated.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +36,16 @@ from reference_trainer.scenes.scene import Scene
 from reference_trainer.scenes.virtual_cameras import depth_bounds
 
 __all__ = ["EVALUATE", "EXPORT", "OPTIONS", "TRAINERS", "named", "settings", "steps", "train", "write_scene"]
+
+
+def with_tests(scene: Scene) -> Scene:
+    """Return a scene whose views are a test view and a training view in turn, renamed to stay in this order.
+
+    gsplat's trainer and nerfstudio tell them apart so, by an interval of two. A test view may return.
+    """
+    pairs = zip(itertools.cycle(scene.test), scene.train, strict=False)
+    views = [replace(view, name=f"{i:03}.png") for i, view in enumerate(itertools.chain.from_iterable(pairs))]
+    return replace(scene, train=tuple(views))
 
 
 def write_scene(scene: Scene, folder: Path) -> None:
@@ -73,6 +86,8 @@ def write_scene(scene: Scene, folder: Path) -> None:
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
     for ply in (sparse / "points3D.ply", folder / "3_views/dense/fused.ply"):
         ply.write_bytes(header.encode() + rows.tobytes())
+    listed = (f"{i} {x} {y} {z} {r} {g} {b} 0\n" for i, (x, y, z, *_, r, g, b) in enumerate(rows.tolist(), start=1))
+    (sparse / "points3D.txt").write_text("".join(listed))
     np.save(sparse / "confidence_dsp.npy", np.zeros((len(rows), 1)))  # of the points, for InstantSplat
     if not (folder / "sparse_3").exists():
         (folder / "sparse_3").symlink_to("sparse")
@@ -188,13 +203,19 @@ TRAINERS[AS_IT_IS] = (
 )
 
 
+SPLATFACTO_TO_THE_END = "splatfacto to the end"
+"""splatfacto-ca, without dropout if plain, at full size throughout, with density control from its own step 500 on."""
+TRAINERS[SPLATFACTO_TO_THE_END] = TRAINERS["splatfacto-ca"].replace("--pipeline.model.warmup-length 100 ", "{option} ")
+TO_THE_END = (AS_IT_IS, SPLATFACTO_TO_THE_END)
+
+
 def settings(trainer: str) -> Sequence[str]:
     """Return what a trainer is trained with: of OPTIONS those that the table shows."""
     if "{option}" not in TRAINERS[trainer]:
         return ["dropout"]
     if ": " in trainer:
         return ["plain"]
-    if trainer == AS_IT_IS:
+    if trainer in TO_THE_END:
         return ["plain", "dropout", "decay"]
     if trainer == "DropGaussian":  # which refuses a second dropout
         return ["plain", "noise"]
@@ -204,7 +225,7 @@ def settings(trainer: str) -> Sequence[str]:
 def named(trainer: str, setting: str, scene: str = "") -> dict[str, str]:
     """Return what a row is of: with the name of the scene, where the file has rows of several."""
     recipe = f"{trainer} {OPTIONS[setting]}".strip() if "{option}" in TRAINERS[trainer] else trainer
-    return {"recipe": recipe} | ({"scene": scene} if trainer == AS_IT_IS else {})
+    return {"recipe": recipe} | ({"scene": scene} if trainer in TO_THE_END else {})
 
 
 def steps(n: int) -> dict[str, int]:
@@ -224,6 +245,8 @@ def train(trainer: str, setting: str, seed: int, out: Path, args: argparse.Names
     environment = os.environ | {"TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": "1"}  # nerfstudio loads its checkpoints as pickles
     environment["PYTHONPATH"] = os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])
     names = vars(args) | steps(args.iterations) | {"out": out, "seed": seed, "option": OPTIONS[setting]}
+    if trainer == SPLATFACTO_TO_THE_END:  # whose options are the method's own; it drops by default
+        names["option"] = (OPTIONS[setting] or "--dropout 0").replace("--", "--pipeline.model.")
     names["scaled"] = "" if setting in ("plain", "noise") else "--regularizer dropout(0.2)"
     names["smaller"] = "" if args.downscale is None else f"--downscale {args.downscale}"
 
@@ -265,7 +288,8 @@ def main() -> None:
     add("--points", default="auto")
     add("--downscale", type=float)
     add("--forks", type=_path, default=_path("forks"), help="where the repositories lie")
-    add("--both", type=_path, help="for gsplat and nerfstudio: a COLMAP folder of the training and test photographs")
+    add("--both", type=_path, help="for gsplat and nerfstudio: a COLMAP folder of the training and test photographs, "
+        "in turn (default: made of the scene)")  # fmt: skip
     add("--trainers", choices=TRAINERS, nargs="+", required=True)
     add("--seeds", type=int, nargs="+", default=[0, 1, 2])
     add("--iterations", type=int, default=500)
@@ -275,7 +299,10 @@ def main() -> None:
     args.fork_scene = args.out / "llff"  # CoR-GS tells its readers by the path
     if not (args.fork_scene / "poses_bounds.npy").is_file():
         options = {name: getattr(args, name) for name in ("images", "split", "points", "downscale")}
-        write_scene(load_scene(SceneOptions(str(args.scene), allow_test_points=True, **options)), args.fork_scene)
+        scene = load_scene(SceneOptions(str(args.scene), allow_test_points=True, **options))
+        write_scene(with_tests(scene), args.out / "both")
+        write_scene(scene, args.fork_scene)
+    args.both = args.both or args.out / "both"
     rows = Rows(args.file, {"scene": args.scene.name, "iterations": args.iterations, "machine": machine(), "usual": {}})
     for seed in args.seeds:
         for trainer in args.trainers:

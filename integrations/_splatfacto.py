@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise
+from ca_reg.decay import OpacityDecay
 from ca_reg.regularizers import parse
 
 from .gsplat import Rasterization, regularized
@@ -56,6 +57,7 @@ class CoAdaptation(_Splatfacto):  # type: ignore[misc]
         if config.regularizer:
             chain, p = parse(config.regularizer), 0.0
         self._regularized = regularized(self._original, chain)
+        self._decay = OpacityDecay(config.opacity_decay, start=config.warmup_length)
         self._score: CAScore | None = None
         if config.ca_samples > 0:
             self._score = CAScore(self._render, samples=config.ca_samples, p=p, layout="HWC")
@@ -70,6 +72,10 @@ class CoAdaptation(_Splatfacto):  # type: ignore[misc]
         if not self.training and self.crop_box is None and "rgb" in outputs:
             self._cameras[outputs["rgb"]] = camera
         return outputs
+
+    def decay_opacities(self, step: int) -> None:
+        """Decay the opacities after a training step, counted from 0, once density control has begun."""
+        self._decay(self.opacities, step + 1)
 
     def update_to_step(self, step: int) -> None:
         """Pass the step of a loaded checkpoint to the regularizers, whose schedules follow it in evaluation."""

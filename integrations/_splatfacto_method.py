@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass, field
+from typing import Any
 
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.models import splatfacto
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -24,6 +26,8 @@ class SplatfactoCAModelConfig(SplatfactoModelConfig):  # type: ignore[misc]
     """share of the Gaussians left out of each training step; evaluation scales the opacities by 1 - dropout"""
     opacity_noise: float = 0.0
     """standard deviation of the relative noise on the opacities in training; the paper uses 0.8"""
+    opacity_decay: float = 1.0
+    """factor on all opacities after each step, from warmup_length on, such as 0.995; 1 leaves them as they are"""
     regularizer: str = ""
     """instead of these two, such as "dropout(0.2) + noise(0.8, scale=True)" or my_module:MyDropout; scored at p = 0"""
     ca_samples: int = 5
@@ -35,6 +39,12 @@ class SplatfactoCAModel(CoAdaptation, SplatfactoModel):  # type: ignore[misc]
 
     config: SplatfactoCAModelConfig
     holder = splatfacto
+
+    def get_training_callbacks(self, training_callback_attributes: Any) -> list[TrainingCallback]:
+        """Return splatfacto's callbacks and, after them, the decay of opacities."""
+        after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+        own = TrainingCallback(after, self.decay_opacities)
+        return [*super().get_training_callbacks(training_callback_attributes), own]
 
 
 def make_method() -> MethodSpecification:

@@ -159,8 +159,8 @@ def parse_options(arguments: Sequence[str] | None, *, in_child: bool = False) ->
     add("--ramp", type=int, metavar="STEPS", help="raise both rates linearly from 0 over so many steps after --start")
     add("--opacity-decay", type=float, metavar="FACTOR", help="multiply all opacities by this after every optimizer "
         "step, e.g. 0.995")  # fmt: skip
-    add("--decay-start", type=int, default=500, metavar="STEP", help="step after which --opacity-decay begins, best "
-        "where density control does (default: 500)")  # fmt: skip
+    add("--decay-start", type=int, metavar="STEP", help="step after which --opacity-decay begins, best where density "
+        "control does (default: 500)")  # fmt: skip
     add("--scope", choices=get_args(Scope), default="main", help="a step's first training render and its batch, or all")
     add("--seed", type=int, default=0, help="of masks and noise (default: 0); the script's random numbers are its own")
     add("--guard", type=Path, metavar="SCENE", help="afterwards write the last .ply again, as *_clean.ply, without "
@@ -219,6 +219,10 @@ def parse_options(arguments: Sequence[str] | None, *, in_child: bool = False) ->
         parser.error("--outputs is about the stand-in, which --cpu asks for")
     if options.dropout is None and options.noise is None and (options.start or options.ramp is not None):
         parser.error("--start and --ramp are about --dropout and --noise: give --regularizer a schedule of its own")
+    if options.decay_start is None:
+        options.decay_start = 500
+    elif options.opacity_decay is None:
+        parser.error("--decay-start is about --opacity-decay")
     try:
         options.hook = _hook(options)
     except (TypeError, ValueError) as error:

@@ -84,6 +84,11 @@ def test_the_scene_of_the_repositories_has_the_training_views_and_the_points_alo
         torch.testing.assert_close(written.camera.world_to_camera, view.camera.world_to_camera, rtol=0, atol=1e-5)
         torch.testing.assert_close(written.image, view.image, rtol=0, atol=0.5 / 255 + 1e-6)
     torch.testing.assert_close(again.points.positions, scene.points.positions)
+    # Where gsplat and nerfstudio take every second photograph for a test, from the first on.
+    both = load_scene(SceneOptions(str(tmp_path / "both"), test="none", allow_test_points=True), trains=False)
+    cameras = torch.stack([view.camera.world_to_camera for view in both.train])
+    for views, own in ((scene.test, cameras[::2]), (scene.train, cameras[1::2])):
+        torch.testing.assert_close(own, torch.stack([view.camera.world_to_camera for view in views]), rtol=0, atol=1e-5)
 
 
 def test_every_command_line_is_complete():

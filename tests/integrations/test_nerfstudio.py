@@ -55,7 +55,10 @@ class Splatfacto(nn.Module):
 
 
 CAMERA = torch.eye(4)[None]
-CONFIG = {"dropout": 0.4, "opacity_noise": 0.0, "regularizer": "", "ca_samples": 5}
+CONFIG = {
+    "dropout": 0.4, "opacity_noise": 0.0, "opacity_decay": 1.0, "warmup_length": 500, "regularizer": "",
+    "ca_samples": 5,
+}  # fmt: skip
 
 
 def make(**changes):
@@ -106,6 +109,14 @@ def test_every_training_step_draws_anew_at_the_rate():
     # 3,600 draws at 0.6: standard deviation 0.0082; five of them fail one run in 1.7 million.
     assert kept.double().mean() == pytest.approx(0.6, abs=0.041)
     assert len({tuple(row.tolist()) for row in kept}) == 60
+
+
+def test_opacities_decay_from_the_step_on_at_which_density_control_begins():
+    model, _ = make(opacity_decay=0.9, warmup_length=3)
+    before = activated(model)
+    for step in range(5):  # nerfstudio's first step is 0: three before density control, two after
+        model.decay_opacities(step)
+    torch.testing.assert_close(activated(model), before * 0.9**2)
 
 
 def test_evaluation_scales_the_opacities_and_masks_nothing():
@@ -213,6 +224,8 @@ STUBS = {
         "__init__": "",
         "models/__init__": "",
         "models/splatfacto": "class SplatfactoModel: ...\nclass SplatfactoModelConfig: ...",
+        "engine/__init__": "",
+        "engine/callbacks": "TrainingCallback = TrainingCallbackLocation = None",
         "plugins/__init__": "",
         "plugins/types": "class MethodSpecification: ...",
     },

@@ -146,6 +146,23 @@ def test_the_real_registry_lists_the_method_or_says_why_not(splatfacto, monkeypa
     assert "libcudart" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_the_real_callbacks_decay_opacities_after_the_step_they_are_told_of(splatfacto):
+    from nerfstudio.engine.callbacks import TrainingCallbackLocation
+
+    config = nerfstudio.SplatfactoCAModelConfig(opacity_decay=0.5)
+    model, optimizers, camera = make_real(splatfacto, config, warmup_length=2)
+    callbacks = model.get_training_callbacks(types.SimpleNamespace(optimizers=optimizers))
+    for step in range(3):
+        train_step(model, optimizers, camera, step)
+        before = model.opacities.detach().sigmoid()
+        for callback in callbacks[2:]:  # splatfacto's own are what train_step does
+            callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+            callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        torch.testing.assert_close(model.opacities.detach().sigmoid(), before * (0.5 if step == 2 else 1))
+
+
 def yaml_round_trip(config):
     """The config as a saved run brings it back."""
     import yaml

@@ -377,6 +377,7 @@ def test_an_installed_command_is_a_script_as_well(tmp_path, monkeypatch):
         (["--dropout", "0.2", "--guard", "nowhere", "SCRIPT"], "there is no scene .*nowhere for --guard"),
         (["--guard", ".", "SCRIPT"], "--guard is .* a plain model needs all it has"),
         (["--opacity-decay", "0.995", "SCRIPT"], "--opacity-decay is for"),
+        (["--dropout", "0.2", "--decay-start", "9", "SCRIPT"], "--decay-start is"),
         (["--dropout", "0.2", "--opacity-decay", "1.5", "SCRIPT"], r"factor must be in \(0, 1\]"),
         (["--dropout", "0.2", "--opacity-decay", "0.9", "--decay-start", "-1", "SCRIPT"], "start must be at least 0"),
         (["--drop", "0.2", "SCRIPT"], "unrecognized arguments|no script"),
