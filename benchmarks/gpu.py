@@ -62,7 +62,8 @@ _HEAD = (
 _STEPS, _CALLS = 1_000, 200
 _TRAININGS: dict[str, tuple[str, dict[str, Any]]] = {
     "dropout": ("3dgs", {"dropout": 0.2}),
-    "the expectation, guarded": ("sparse", {}),
+    "the expectation": ("3dgs", {"dropout": 0.2, "analytic": True}),
+    "the recipe sparse": ("sparse", {}),
     "Binocular3DGS, dropout": ("binocular", {"dropout": 0.2}),
 }
 _SIZES = {"small": (20_000, 400, 0.02), "middle": (100_000, 800, 0.012), "large": (500_000, 800, 0.006)}

@@ -72,6 +72,7 @@ little = gpu.synthetic_scene(16, 12, points=9)
 gpu.synthetic_scene = lambda: little
 os.environ.pop("CA_REG_DATA", None)
 gpu._TRAININGS["nothing"] = "3dgs", {"renderer": "gsplat"}
+del gpu._TRAININGS["the recipe sparse"]  # whose guard takes the interpreter half a minute; `interpreted.py` has one
 gpu.find_spec = lambda name: name  # a gsplat that does not work
 sys.modules["gsplat"] = SimpleNamespace(__version__="1.5.3")
 called = []

@@ -335,21 +335,17 @@ def files_of(folder: Path) -> dict[Path, int]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["processes", "ray"])
 @pytest.mark.usefixtures("one_thread")
-def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(name, tmp_path, options, monkeypatch, said):
+def test_a_run_whose_worker_is_killed_ends_as_if_nothing_had_happened(tmp_path, options, monkeypatch, said):
     """The worker of seed 1 is killed at its first checkpoint; a second call starts no worker and writes no run."""
-    if name == "ray":
-        pytest.importorskip("ray")
-    monkeypatch.setenv("PYTHONPATH", PYTHONPATH)  # Ray passes it to its workers
+    monkeypatch.setenv("PYTHONPATH", PYTHONPATH)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)  # one thread for each of two workers: the bits depend on it
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr("reference_trainer.runs.grid.train_run", sweep_tasks.train_and_be_killed_once)
     config = TrainConfig(iterations=60, dropout=0.2)
     whole = run_experiment(options, dataclasses.replace(config, seed=1), tmp_path / "whole", monitoring=Monitoring(0))
 
     out = tmp_path / "sweep"
-    running = Running(choose_executor(name, jobs=2), monitoring=Monitoring(0, checkpoint_every=10))
+    running = Running(choose_executor("processes", jobs=2), monitoring=Monitoring(0, checkpoint_every=10))
     comparison = compare({out: options}, {"dropout": config}, [0, 1], running)[out]
     assert (out / "dropout" / "seed_1" / "killed").exists()
     assert sum("again with another (1 of 3)" in line for line in said) == 1
