@@ -23,5 +23,5 @@ def test_damaged_files(target, tmp_path):
 @pytest.mark.slow
 @targets
 def test_many_damaged_files(target, tmp_path):
-    count = 100 if target.form == "state" else 250
+    count = 50 if target.form == "state" else 120
     assert not fuzz(target, tmp_path, range(1000, 1000 + count)).defects

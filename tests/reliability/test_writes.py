@@ -79,9 +79,8 @@ def test_a_careless_writer_is_found_out(tmp_path, power, after):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("first", "power"), [(3, False), (23, True)])
-def test_runs_killed_at_some_of_their_operations_and_again(tmp_path, first, power):
-    """Kills and power cuts take turns: each run of the campaign costs four processes that import torch."""
-    operations, out = campaign(SHORT, tmp_path, first=first, every=60, power=power, again=0)
+def test_runs_killed_at_some_of_their_operations_and_again(tmp_path):
+    """By power cuts, which lose more than kills; each run costs four processes that import torch, so these are few."""
+    operations, out = campaign(SHORT, tmp_path, first=23, every=40, power=True, again=0)
     assert out.defects == []
-    assert out.kills == out.finished == 2 * len(operations[first - 1 :: 60]) >= 6
+    assert out.kills == out.finished == 2 * len(operations[22::40]) >= 6

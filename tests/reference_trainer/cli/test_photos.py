@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import webbrowser
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from reference_trainer.runs.run import load_run
 from reference_trainer.scenes import photographs, poses, synthetic_scene
 from reference_trainer.scenes.images import read_image
 from reference_trainer.training.losses import LOSSES
+from reference_trainer.training.recipes import RECIPES
 
 SCENE = synthetic_scene(width=40, height=30, points=150)
 
@@ -168,6 +170,8 @@ def test_a_run_that_is_moved_takes_its_photographs_along(garden, tmp_path, capsy
 @pytest.mark.slow
 def test_models_of_several_kinds_become_one(garden, tmp_path, capsys, monkeypatch):
     """What is finished stays where it is moved to, and another number of models is refused before anything is done."""
+    short = replace(RECIPES["distilled"], config=replace(RECIPES["distilled"].config, iterations=5))
+    monkeypatch.setitem(RECIPES, "distilled", short)
     command = ["run", "garden", "--out", "out", "--no-open"]
     main([*command, "--members", "3", "--quick"])
     out = tmp_path / "out"
@@ -182,7 +186,7 @@ def test_models_of_several_kinds_become_one(garden, tmp_path, capsys, monkeypatc
     assert term.members == tuple(str(out / "members" / str(seed) / "point_cloud.ply") for seed in range(3))
     assert (options.init, config.dropout) == (term.members[0], 0.2)
     finished = load_run(out)
-    assert finished.step == 300
+    assert finished.step == 5
     assert not finished.gaussians.means.equal(members[0].gaussians.means)
 
     before = seen(out)
@@ -193,7 +197,7 @@ def test_models_of_several_kinds_become_one(garden, tmp_path, capsys, monkeypatc
     before = seen(moved)
     main(["run", "garden", "--out", "moved", "--no-open", "--members", "3", "--quick"])
     assert seen(moved) == before
-    assert load_run(moved).step == 300
+    assert load_run(moved).step == 5
     main(["run", "garden", "--out", "moved", "--no-open", "--quick", "--from", "train"])
     assert not (moved / "members").exists()
     assert "one model" in refused(["run", "garden", "--out", "moved", "--members", "2", "--quick"], capsys)

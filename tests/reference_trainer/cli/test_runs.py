@@ -292,13 +292,10 @@ def test_a_capture_needs_no_word_of_explanation(data_root, tmp_path, monkeypatch
     main(["plan", scene, *best])
     assert "3 training views" in capsys.readouterr().out
     main(["train", scene, *best, *quick, "--iterations", "30", "--out", "runs/mine"])
-    main(["compare", scene, *quick, "--iterations", "10", "--seeds", "1", "--strategies", "baseline", "dropout"])
     main(["report", "runs/mine"])
-    main(["report", "runs/compare"])
     said = plain(capsys.readouterr().out)
     assert "exact CA (1e-3)" in said
     results = json.loads((tmp_path / "runs/mine/results.json").read_text())
     assert 5 < results["mean"]["test"]["psnr"] < 40
     assert results["mean"]["test"]["ca_exact_half"] > 0
-    assert all("<html" in (tmp_path / "runs" / file).read_text("utf-8") for file in
-               ("mine/report.html", "compare/report.html"))  # fmt: skip
+    assert "<html" in (tmp_path / "runs/mine/report.html").read_text("utf-8")

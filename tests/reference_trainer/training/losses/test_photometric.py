@@ -128,8 +128,8 @@ def test_float32_stays_near_float64(level):
     # The variances are differences of numbers near level^2, each rounded to some 2^-24 level^2 per operation; a few
     # dozen operations over the smallest denominator, 9e-4, bound the error. Flat images are the worst case.
     generator = torch.Generator().manual_seed(0)
-    target = (level + 1e-3 * torch.randn(3, 40, 50, generator=generator)).float()
-    image = (target + 1e-3 * torch.randn(3, 40, 50, generator=generator)).float().to(DEVICE)
+    target = (level + 1e-3 * torch.randn(3, 20, 25, generator=generator)).float()
+    image = (target + 1e-3 * torch.randn(3, 20, 25, generator=generator)).float().to(DEVICE)
     target = target.to(DEVICE)
     bound = 32 * 2**-24 * max(level, 0.05) ** 2 / 9e-4 + 1e-5
     exact, x = ssim_map(image.double(), target.double()), image.clone().requires_grad_()
@@ -141,7 +141,7 @@ def test_float32_stays_near_float64(level):
 
 
 def test_float32_gradient_of_textured_images():
-    image, target = pair(40, 50)
+    image, target = pair(20, 25)
     image32, target32 = image.float().to(DEVICE).requires_grad_(), target.float().to(DEVICE)
     photometric_loss(image32, target32).backward()
     image.requires_grad_()
