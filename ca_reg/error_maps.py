@@ -13,12 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from ca_reg._accumulate import finite_colors
 from ca_reg._check import check_callable, check_opacity, check_opacity_range, check_rate, check_tensor
 from ca_reg.functional import Multiplier
 from ca_reg.lists import ListMoments
@@ -32,6 +34,7 @@ PLAIN_RATE = 0.1
 SMOOTHING = 1.0
 """Standard deviation, pixels, of the blur of the map: errors are wider than a pixel, and the features noisy."""
 
+_BRIGHTEST = 16.0  # no color of a model is that far above 1, and hardly a picture of 8 bits stays below
 _NORMAL_80 = 1.2816  # 80 % of a normal distribution lie within so many standard deviations
 
 
@@ -152,12 +155,13 @@ def error_map(
         view: what ``render_fn`` takes.
         moments_fn: the renderer's exact moments.
         p: dropout rate that the model was trained with; the image is rendered with opacities of ``1 - p``.
-        layout: order of the axes of the images.
+        layout: order of the axes of the renderer's images; those of moments may also be CHW.
         known: further features, see :func:`expected_error`, such as ``warp`` and ``hidden``.
 
     Raises:
         TypeError: if an argument is of the wrong type.
-        ValueError: if one is out of range, ``opacity`` looks like logits, or ``render_fn`` returns no alpha.
+        ValueError: if one is out of range, ``opacity`` looks like logits, ``render_fn`` returns no alpha, or one above
+            1, or what was rendered is not finite where alpha is not 0.
 
     Example:
         A wall with a hole: what is not covered is expected to be wrong.
@@ -178,14 +182,36 @@ def error_map(
     image, alpha = read_rendering(render_fn(expected.clone(), view), layout=layout)  # a copy: it may edit them
     if alpha is None:
         raise ValueError("render_fn must return an alpha beside the image, got the image alone: return (image, alpha).")
+    image = _checked(image, alpha, "an image")
+    if image.numel() and float(image.amax()) > _BRIGHTEST:
+        raise ValueError(
+            f"an image must have colors in [0, 1], got values up to {float(image.amax()):g}: divide by 255."
+        )
     features = {"empty": (1 - alpha).clamp_min(0), "contrast": contrast(image)}
     if isinstance(moments_fn, ListMoments):
         features["colors"] = moments_fn.color_variance(expected, view).sqrt()
-        layout = "CHW"  # of its moments, whatever the layout of the renderer
     if moments_fn is not None:
         moments = moments_fn(opacity.detach().clone(), view, Multiplier.dropout(p or PLAIN_RATE), None)
-        features["deviation"] = read_moments(moments, layout=layout).variance.mean(0).clamp_min(0).sqrt()
+        variance = _read_variance(moments, image, layout)
+        features["deviation"] = _checked(variance, alpha, "a variance").mean(0).clamp_min(0).sqrt()
     return expected_error({**features, **known})
+
+
+def _checked(colors: Tensor, alpha: Tensor, what: str) -> Tensor:
+    """Return colors (3, H, W) with 0 where they are not finite because alpha is 0; raise a ValueError for others."""
+    finite, broken = finite_colors(colors, alpha, alpha, 0.0)
+    if broken:
+        raise ValueError(f"{what} or its alpha is nan or infinite where alpha is not 0: look at the model's render.")
+    return finite
+
+
+def _read_variance(moments: Any, image: Tensor, layout: Layout) -> Tensor:
+    """Return the variance (3, H, W) in the layout of the renderer or in that of this package's moments, CHW."""
+    if layout == "HWC":
+        with suppress(ValueError):
+            if (read := read_moments(moments, layout="HWC").variance).shape == image.shape:
+                return read
+    return read_moments(moments).variance
 
 
 def contrast(image: Tensor) -> Tensor:

@@ -226,7 +226,9 @@ class _Walk(NamedTuple):
         lengths, by_length = torch.sort(starts.diff(), stable=True, descending=True)
         ranks = torch.empty_like(starts[1:]).scatter_(0, by_length, torch.arange(size, dtype=dtype, device=device))
         lengths = lengths.flip(0).cpu()  # the one wait for a GPU
-        counts = size - torch.searchsorted(lengths, torch.arange(int(lengths[-1]), dtype=dtype), right=True)
+        counts = size - torch.searchsorted(
+            lengths, torch.arange(int(lengths[-1]), dtype=dtype, device="cpu"), right=True
+        )
         offsets = (counts.sum() - counts.cumsum(0)).to(device, dtype, non_blocking=True)
         places = torch.arange(entries, dtype=dtype, device=device).sub_(starts.index_select(0, pixels))
         target = offsets.index_select(0, places).add_(ranks.index_select(0, pixels))

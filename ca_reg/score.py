@@ -101,6 +101,9 @@ class CAScore:
         (<Reason.OK: ...>, True, torch.Size([4, 4]))
     """
 
+    _sums: Tensor
+    _updates: int
+
     def __init__(
         self,
         render_fn: RenderFn,
@@ -259,7 +262,7 @@ class CAScore:
         is the position in the whole set.
         """
         result = self(opacity, view, index=view_position(self._updates) if index is None else index)
-        self._sums += row_of(result)
+        self._sums = self._sums + row_of(result)  # not in place: it may be a tensor of inference mode
         self._updates += 1
         return result
 

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import abc
 from collections import Counter
-from collections.abc import MutableMapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import TracebackType
 from typing import Any, Self
-from weakref import WeakKeyDictionary
 
+from torch import Tensor
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 
 from ca_reg._check import check_count
 from ca_reg.decay import OpacityDecay
+
+from ._decaying import OPACITY_GROUPS, ScriptDecay
 
 
 class Skip(StrEnum):
@@ -88,18 +89,12 @@ class Tally:
         return lines
 
 
-_NAMES = ("opacity", "opacities")  # parameter groups in the INRIA family and in gsplat's trainers
-_UNDECAYED = (
-    "Opacities do not decay: no optimizer has a parameter group that is named opacity or opacities. Leave out "
-    "--opacity-decay, and call ca_reg.decay.OpacityDecay in the script, after its optimizer's step."
-)
-
-
 class Hook(abc.ABC):
     """Regularizes scripts without edits, from `install` to `uninstall`, or within a ``with`` block.
 
     Optimizer steps count if a parameter group is named ``opacity`` or ``opacities``: other optimizers train networks,
-    poses or exposures. After each of them ``decay`` fades the logits of that group; its steps are the optimizer's own.
+    poses or exposures. After each of them ``decay`` fades the logits of that group; its steps are those of the training
+    where they are known, and else the optimizer's own.
 
     It is an error if more than ``patience`` optimizer steps in a row have no regularized render, or if more than that
     many training steps in all have no render; 0 for no limit. ``tally`` counts what was done so far.
@@ -108,8 +103,7 @@ class Hook(abc.ABC):
     def __init__(self, patience: int, decay: OpacityDecay | None = None) -> None:
         check_count(patience, "patience", minimum=0)
         self.tally = Tally()
-        self._decay = decay
-        self._steps: MutableMapping[Optimizer, int] = WeakKeyDictionary()
+        self._decay = None if decay is None else ScriptDecay(decay)
         self._patience = patience
         self._optimized = self._idle = 0  # optimizer steps: all, and those since the last regularized render
         self._handle: Any = None
@@ -135,8 +129,9 @@ class Hook(abc.ABC):
         """Describe a failure to regularize, or to decay, and its remedy; else None. A patience of 0 takes any."""
         if shortfall := self._patience and self.tally.shortfall(self._optimized):
             return f"{shortfall} {self._explain()}"
-        undecayed = self._decay is not None and self.tally.regularized > 0 and not self._optimized
-        return _UNDECAYED if self._patience and undecayed else None
+        if self._decay is None or not (self._patience and self.tally.regularized):
+            return None
+        return self._decay.problem()
 
     def __enter__(self) -> Self:
         """Install the hook unless it is installed."""
@@ -150,11 +145,16 @@ class Hook(abc.ABC):
         if error is None and self._optimized and (problem := self.problem()):
             raise RuntimeError(problem)
 
-    def note_regularized(self) -> None:
-        """Record a training render that was regularized, or whose rate is 0; RuntimeError if nothing can decay."""
+    def note_regularized(self, opacities: Tensor, step: int | None = None) -> None:
+        """Record a training render that was regularized, or whose rate is 0: its opacities and its step, if known.
+
+        Raises a RuntimeError if nothing can decay.
+        """
         self._idle = 0
-        if self._decay is not None and not self._optimized and 0 < self._patience < self.tally.regularized:
-            raise RuntimeError(_UNDECAYED)
+        if self._decay is not None:
+            self._decay.note_render(opacities, step)
+            if not self._decay.found and 0 < self._patience < self.tally.regularized:
+                raise RuntimeError(self._decay.problem())
 
     def note_lost(self) -> None:
         """Record a training step without a render; raise RuntimeError if there are too many."""
@@ -172,16 +172,14 @@ class Hook(abc.ABC):
             self._handle = None
 
     def _stepped(self, optimizer: Optimizer, args: Any, kwargs: Any) -> None:
-        of_opacities = [group for group in optimizer.param_groups if group.get("name") in _NAMES]
-        if of_opacities:
+        logits = [x for group in optimizer.param_groups if group.get("name") in OPACITY_GROUPS for x in group["params"]]
+        if logits:
             self._optimized += 1
             self._idle += 1
             self._check(self._idle, "optimizer steps of the Gaussians in a row, and no render was regularized")
             if self._decay is not None:
-                self._steps[optimizer] = step = self._steps.get(optimizer, 0) + 1
-                for logits in (x for group in of_opacities for x in group["params"]):
-                    self._decay(logits, step)
-                self.tally.decayed += step > self._decay.start
+                self._decay.follow(optimizer, logits)
+                self.tally.decayed = self._decay.count
 
     def _check(self, count: int, what: str) -> None:
         if 0 < self._patience < count:

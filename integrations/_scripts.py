@@ -62,8 +62,11 @@ class Sources:
         """Whether a module is a source file below the root, and not an extension to be compiled there."""
         return _is_own(self.root, module)
 
-    def read(self, path: Path, folder: Path) -> list[tuple[int, str]]:
-        """Read a file of the folder; return the modules it may import, each with its relative-import level."""
+    def read(self, path: Path, folder: Path, *, main: bool = False) -> list[tuple[int, str]]:
+        """Read a file of the folder; return the modules it may import, each with its relative-import level.
+
+        Classes of the main program are no models: they are made while it runs, and no import shows them before.
+        """
         try:
             nodes = list(ast.walk(ast.parse(path.read_bytes())))
         except SyntaxError:  # Python will report it at run time
@@ -77,7 +80,7 @@ class Sources:
                 origin = _absolute(module, node.level, node.module)
                 if names and not _is_own(folder, origin):
                     self.rasterizers.setdefault(origin, set()).update(names)
-            elif isinstance(node, ast.ClassDef) and module:
+            elif isinstance(node, ast.ClassDef) and module and not main:
                 methods = {part.name: part.args for part in node.body if isinstance(part, ast.FunctionDef)}
                 arguments = methods.get("update_learning_rate")
                 # Without an argument it may be a scheduler's, called for anything but a step of a model.
@@ -105,7 +108,7 @@ def read_script(script: Path | str) -> Sources:
             continue
         read.add(path)
         sources.root = min(sources.root, origin)
-        for level, name in sources.read(path, origin):
+        for level, name in sources.read(path, origin, main=path == start.resolve()):
             for place in (folder, folder.parent)[: 1 + above] if level == 0 else (path.parents[level - 1],):
                 module = place.joinpath(*name.split("."))
                 files += [
@@ -184,7 +187,7 @@ def run_script(script: Path | str) -> None:
 
 _VARIABLE = "CA_REG_IN_CHILDREN"
 _LAUNCHER = f"{__package__}.run"
-_PYTHON = re.compile(r"(?:^|[/\s;&|])python[\d.]*(?:\.exe)?(?=\s|$)")
+_PYTHON = re.compile(r"(?:^|[/\s;&|])(?<!include/)python[\d.]*(?:\.exe)?(?=\s|$)")
 _ISOLATED = re.compile(r"\s-[a-zA-Z]*[IES]")  # such a Python reads neither PYTHONPATH nor sitecustomize
 _MODELS = (".ply", ".pth", ".pt", ".ckpt", ".npz")
 _POINTS = ("input.ply", "points3D.ply", "points3d.ply")  # the initial points, which the INRIA family copies
@@ -285,7 +288,9 @@ class ScriptAudit:
     _hooked = False
 
     def __init__(self) -> None:
-        self.saved: str | None = None  # path of the model that was written last, as far as Python's own files go
+        # Paths of the model and of the .ply that were written last, as far as Python's own files go.
+        self.saved: str | None = None
+        self.saved_ply: str | None = None
         self.missed: list[str] = []  # commands of Python processes that do not see the environment of `in_children`
 
     def __enter__(self) -> ScriptAudit:
@@ -303,6 +308,7 @@ class ScriptAudit:
             path, mode = str(arguments[0]), str(arguments[1])
             if "w" in mode and path.endswith(_MODELS) and not path.endswith(_POINTS):
                 self.saved = os.path.abspath(path)  # the script may change the working directory
+                self.saved_ply = self.saved if path.endswith(".ply") else self.saved_ply
         elif event == "os.system":
             self._check(os.fsdecode(arguments[0]), os.environ)
         elif event == "subprocess.Popen":

@@ -17,7 +17,7 @@ from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise
 from ca_reg.decay import OpacityDecay
 from ca_reg.regularizers import parse
 
-from .gsplat import Rasterization, regularized
+from .gsplat import Rasterization, Regularized, regularized
 
 _of_the_model: ContextVar[Rasterization | None] = ContextVar("_of_the_model", default=None)
 
@@ -56,6 +56,11 @@ class CoAdaptation(_Splatfacto):  # type: ignore[misc]
         chain, p = Chain(GaussianDropout(config.dropout), OpacityNoise(config.opacity_noise)), config.dropout
         if config.regularizer:
             chain, p = parse(config.regularizer), 0.0
+        if isinstance(self._original, Regularized):
+            raise ValueError(
+                "splatfacto-ca has regularizers of its own, and opacities would be dropped twice: leave out --dropout, "
+                "--noise and --regularizer of the launcher, or train splatfacto."
+            )
         self._regularized = regularized(self._original, chain)
         self._decay = OpacityDecay(config.opacity_decay, start=config.warmup_length)
         self._score: CAScore | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any, Literal
 
 from torch import Tensor
@@ -11,7 +11,7 @@ from torch import Tensor
 Steps = Literal["updates", "parameters"]
 """What marks a new step: a call of ``update_learning_rate``, or a change of the parameters."""
 
-_FINISHED = 2**31  # the step of a model that is only evaluated: past the end of every schedule
+FINISHED = 2**31  # the step of a model that is only evaluated: past the end of every schedule
 _RENDERS_WITHOUT_STEP = 256  # of one model; no code base renders so many views in one step
 _NODES = 1000  # largest number of autograd nodes to search for a parameter
 
@@ -112,7 +112,7 @@ class Iterations:
         """Return the step of a model or parameter, else the latest of any; past all schedules if none was trained."""
         trained = [(ref(), steps.training_step) for ref, steps in self._models if steps.step or steps.renders]
         own = [step for known, step in trained if known is owner]
-        return max(own or (step for _, step in trained), default=_FINISHED)
+        return max(own or (step for _, step in trained), default=FINISHED)
 
     def update(self, model: Any, iteration: int) -> None:
         """Process a call of update_learning_rate, unless steps are set explicitly."""
@@ -130,14 +130,14 @@ class Iterations:
             self._lose_step()
 
 
-def leaf_of(x: Tensor) -> Tensor | None:
-    """Return a parameter that a tensor was computed from, the same one for the same computation; None if none."""
+def leaves_of(x: Tensor) -> Iterator[Tensor]:
+    """Iterate over the parameters that a tensor was computed from, nearest first and in an order of their own."""
     if x.is_leaf:
-        return x
+        yield x
+        return
     nodes: list[Any] = [x.grad_fn]
     for node in nodes:
         if isinstance(leaf := getattr(node, "variable", None), Tensor):
-            return leaf
+            yield leaf
         if len(nodes) < _NODES:
             nodes += [node for node, _ in node.next_functions if node is not None]
-    return None

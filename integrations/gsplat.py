@@ -26,8 +26,9 @@ from torch import Tensor, nn
 from ca_reg._random import seeded
 from ca_reg.decay import OpacityDecay
 
-from ._calls import Call, Signature, chain_of
+from ._calls import Call, CallSite, Signature, chain_of
 from ._report import Hook, Tally
+from ._steps import FINISHED, leaves_of
 
 __all__ = [
     "Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized_calls",
@@ -156,16 +157,20 @@ class Regularized:
         call = _GsplatCall(self.rasterization, self._signature, args, kwargs)
         opacities: Tensor = call.arguments["opacities"]
         trains = trains and torch.is_grad_enabled() and opacities.requires_grad
+        if trains and self._hook is not None:
+            trains = not _of_a_model_in_evaluation(opacities)
         keep = None
         if not trains:
-            call.evaluate(self.chain, self.chain.step, self.tally)
+            # What only evaluates in this process was trained before: past the end of every schedule.
+            trained = self._hook is None or self._hook.tally.regularized
+            call.evaluate(self.chain, self.chain.step if trained else FINISHED, self.tally)
         else:
             if self._hook is not None:
                 self.chain.set_step(next(self._hook.steps))
             generator = self._generator if self._hook is None else self._hook.generator(opacities.device)
             keep = call.train(self.chain, self.chain.step, self.tally, generator)
             if self._hook is not None:
-                self._hook.note_regularized()
+                self._hook.note_regularized(opacities)
         *images, info = call()
         if keep is not None:  # on several GPUs, too: info holds this rank's Gaussians, in the cameras of all ranks
             self._hide_dropped(info, keep.view_as(opacities))
@@ -183,7 +188,7 @@ class Regularized:
         if gaussians is None:
             per_camera = keep.unsqueeze(-2)  # [..., 1, N]
             info["radii"] = radii * (per_camera if radii.ndim == per_camera.ndim else per_camera.unsqueeze(-1))
-        elif self._missed < _EVIDENCE:
+        elif self._missed < _EVIDENCE and keep.numel():
             # Whether they are listed depends on gsplat's version alone. The check synchronizes a GPU, so it ends once
             # enough Gaussians were dropped for some to have been listed; a draw that drops none tells nothing.
             batches = info.get("batch_ids")
@@ -196,6 +201,15 @@ class Regularized:
                     "gsplat.rasterization, install gsplat>=1.5."
                 )
             self._missed += kept * (1 - share) / max(share, 1e-6)
+
+
+def _of_a_model_in_evaluation(opacities: Tensor) -> bool:
+    """Whether the caller is a model in ``eval()`` whose own these are: nerfstudio evaluates losses with gradients."""
+    caller = CallSite.find().variables.get("self")
+    if not isinstance(caller, nn.Module) or caller.training:
+        return False
+    own = {id(x) for x in caller.parameters()}
+    return any(id(x) in own for x in leaves_of(opacities))
 
 
 class Installation(Hook):

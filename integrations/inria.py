@@ -33,7 +33,7 @@ from ._calls import (
 )
 from ._patching import PatchedClasses, is_overridden, rendered_once
 from ._report import Hook, Skip
-from ._steps import Iterations, ModelSteps, Steps, leaf_of
+from ._steps import Iterations, ModelSteps, Steps, leaves_of
 
 __all__ = ["DEFAULT_MODEL", "RasterizerHook", "Scope", "Steps", "render_fn"]
 
@@ -217,7 +217,7 @@ class RasterizerHook(Hook):
             return self._leave(call, Skip.CONSTANT_OPACITY)
         if not means.requires_grad:
             return self._leave(call, Skip.DETACHED_MEANS)
-        parameters = [x for x in (means if means.is_leaf else None, leaf_of(opacities)) if x is not None]
+        parameters = [x for x in (means if means.is_leaf else None, next(leaves_of(opacities), None)) if x is not None]
         # Without a model, a parameter takes its place; without either, all calls belong to one model.
         steps = self._iterations.steps_of(model if model is not None else parameters[0] if parameters else self)
         if not steps.count_render(parameters, site.place) and self._scope == "main":
@@ -251,8 +251,9 @@ class RasterizerHook(Hook):
         # The chain checks the first opacities, even if its member was called before.
         regularizer = self._trained if self.tally.regularized else self._chain
         regularizer.set_step(step)
+        opacities = call.arguments["opacities"]
         keep = call.train(regularizer, step, self.tally, generator)
-        self.note_regularized()
+        self.note_regularized(opacities, step)
         returned = call()
         return returned if keep is None else hide_dropped(returned, keep)
 
@@ -292,7 +293,7 @@ class RasterizerHook(Hook):
             share, self._zeros = float(counted), None
         if wait and self._latest is not None:
             share = max(share, float((self._latest == 0).float().mean()))
-        if share <= _MANY_ZEROS:
+        if not share > _MANY_ZEROS:  # of no Gaussians it is nan
             return None
         return (
             f"Gaussians would be dropped twice: {share:.2%} of the opacities of a training render are 0 already, which "

@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if ended.code or options.guard is None:
             raise
     if options.guard is not None:
-        _guard(options, audit.saved)
+        _guard(options, audit.saved_ply)
 
 
 def _launch(options: argparse.Namespace, arguments: Sequence[str], audit: ScriptAudit) -> None:
@@ -100,7 +100,7 @@ def _launch(options: argparse.Namespace, arguments: Sequence[str], audit: Script
 
 def _guard(options: argparse.Namespace, saved: str | None) -> None:
     """Write the model that the script wrote last again, without what hangs where nobody took a photograph."""
-    if saved is None or not saved.endswith(".ply"):
+    if saved is None:
         raise SystemExit("[ca_reg] ERROR: --guard: the script was not seen to write a .ply, and nothing was removed.")
     rates = [("dropout", options.dropout), ("noise", options.noise)]
     trained = [options.regularizer, *(f"{name}({rate})" for name, rate in rates if rate is not None)]

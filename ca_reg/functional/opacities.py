@@ -269,14 +269,15 @@ def decayed_logits(logits: Tensor, factor: float) -> Tensor:
     """Return the logits of opacities that are multiplied by a factor, ``logit(factor * sigmoid(logits))``.
 
     Args:
-        logits: the trained parameter whose sigmoid is the opacity, of any shape and floating-point type.
+        logits: the trained parameter whose sigmoid is the opacity, of any shape.
         factor: in (0, 1].
 
     Returns:
         A new tensor. What has faded to a logit of -16, an opacity of 1e-7, stays there, or it would be exactly 0 later.
 
     Raises:
-        TypeError: if the logits are no floating-point tensor, or the factor is no number.
+        TypeError: if the logits are no floating-point tensor, or of bfloat16, whose spacing swallows a factor of 0.995,
+            or the factor is no number.
         ValueError: if the factor is outside (0, 1].
 
     Example:
@@ -286,6 +287,8 @@ def decayed_logits(logits: Tensor, factor: float) -> Tensor:
     check_tensor(logits, "logits", "give the parameter whose sigmoid is the opacity")
     if not logits.is_floating_point():
         raise TypeError(f"logits must be a floating-point tensor, got {logits.dtype}.")
+    if logits.dtype == torch.bfloat16:
+        raise TypeError("bfloat16 is too coarse for opacities that decay: keep the trained logits in float32.")
     check_factor(factor)
     if factor == 1:
         return logits.clone()

@@ -63,15 +63,16 @@ class IndependentDropout(Regularizer):
             return Draw()
         draw = keep_mask if self.bounded else functional.draw_keep_mask
         count, device = x.opacities.shape[0], x.opacities.device
-        return Draw(keep=draw(count, rates, generator=generator, device=device))
+        keep = draw(count, rates, generator=generator, device=device)
+        return Draw(rates if self.compensate else None, keep)
 
     def replay(self, x: Params, draw: Draw) -> Params:
-        """Set the opacities of dropped Gaussians to 0; if asked to, compensate the others for the rates of ``x``."""
+        """Set the opacities of dropped Gaussians to 0; if asked to, compensate the others for the rates of the draw."""
         if draw.keep is None:
             return x
         opacities = functional.apply_dropout(x.opacities, draw.keep)
-        if self.compensate:  # which alone needs the rates again; some are the ranks of a whole model
-            opacities = compensated(opacities, self.rates(x))
+        if self.compensate:
+            opacities = compensated(opacities, self.rates(x) if draw.value is None else draw.value)
         return x._replace(opacities=opacities)
 
     def expected(self, x: Params) -> Params:

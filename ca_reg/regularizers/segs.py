@@ -58,7 +58,8 @@ class SEGSNoise(Regularizer):
         if is_zero(ratio):
             return Draw()
         means, scales, rows = _geometry(x)
-        logits = x.opacities[:, None].logit(eps=1e-6)  # finite even where another regularizer has dropped a Gaussian
+        # Finite even where another regularizer has dropped a Gaussian; in 16 bits, 1 - 1e-6 would be 1.
+        logits = x.opacities[:, None].to(torch.promote_types(x.opacities.dtype, torch.float32)).logit(eps=1e-6)
         draws = []
         for raw in (means, logits, scales.log(), rows.flatten(1)):
             noise = functional.draw_opacity_noise(raw.numel(), ratio, generator=generator, device=raw.device)

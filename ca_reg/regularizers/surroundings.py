@@ -28,11 +28,11 @@ M = TypeVar("M", bound=nn.Module)
 class Refreshed(nn.Module):
     """Keeps a measurement of the surroundings between steps, because a neighbor search takes longer than a step.
 
-    A tensor with one row per Gaussian, measured again every ``every`` steps and when their number changes. If the step
-    has not advanced it is recomputed unless the very same means come again, unmodified: one object may score several
-    models. ``state_dict`` holds the tensor and its step; a checkpoint without them starts afresh. Pruning as many
-    Gaussians as are added goes unnoticed until the next refresh. The capture of a CUDA graph, which would never measure
-    again, is refused with a RuntimeError.
+    A tensor with one row per Gaussian, measured again every ``every`` steps and when their number changes. If the
+    step has not advanced it is recomputed unless the very same means come again, unmodified as far as torch knows:
+    one object may score several models. ``state_dict`` holds the tensor and its step; a checkpoint without them
+    starts afresh. Pruning as many Gaussians as are added goes unnoticed until the next refresh. The capture of a
+    CUDA graph, which would never measure again, is refused with a RuntimeError.
     """
 
     value: Tensor | None
@@ -64,8 +64,9 @@ class Refreshed(nn.Module):
         assert self.value is not None
         if len(self.value) != len(x.means):
             return False  # densified or pruned: rows no longer belong to their Gaussians
-        same = self._seen is not None and self._seen[0]() is x.means and self._seen[1] == _version(x.means)
-        return same or 0 < (x.step or 0) - self.since < self.every
+        if (advanced := (x.step or 0) - self.since) > 0:
+            return advanced < self.every  # whether or not torch saw the means change: some optimizers hide it
+        return self._seen is not None and self._seen[0]() is x.means and self._seen[1] == _version(x.means)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "_seen"}

@@ -85,10 +85,11 @@ def test_scores_are_those_of_the_processor(scenes, kind):
     assert found[1] == pytest.approx(found[0], rel=1e-12)
 
 
-def test_a_score_goes_on_under_another_default_device(scenes, card):
+@pytest.mark.parametrize("exact", [False, True])
+def test_a_score_goes_on_under_another_default_device(scenes, card, exact):
     """As after ``torch.set_default_device("cuda")``."""
     scene = scenes[1]
-    score = CAScore(scene.render, threshold=0.1)
+    score = CAScore.exact(ListMoments(scene.lists), threshold=0.1) if exact else CAScore(scene.render, threshold=0.1)
     first = score.update(scene.opacity, None)
     with card:
         second = score.update(scene.opacity, None)

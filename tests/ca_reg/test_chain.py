@@ -52,7 +52,7 @@ def test_test_time_value_and_multiplier_are_the_mean_and_variance_over_all_masks
     square = torch.zeros_like(OPACITY)
     for keep in all_masks(4):
         weight = torch.where(keep, 1 - rates, rates).prod()
-        drawn = rule.replay(x, Draw(keep, keep)).opacities
+        drawn = rule.replay(x, Draw(keep=keep)).opacities
         mean, square = mean + weight * drawn, square + weight * drawn**2
     torch.testing.assert_close(rule.expected(x).opacities, mean, rtol=1e-14, atol=0)
     raised, multiplier = rule.alpha_factor(x)

@@ -52,6 +52,7 @@ def test_a_training_decays_after_its_steps_and_keeps_the_optimizers_state():
         (lambda: OpacityDecay("0.9"), TypeError, "factor must be a real number, got str"),
         (lambda: OpacityDecay(start=-1), ValueError, "start must be at least 0"),
         (lambda: OpacityDecay()([0.5], 501), TypeError, "logits must be a torch tensor, got list; give the parameter"),
+        (lambda: OpacityDecay()(torch.zeros(2).bfloat16(), 501), TypeError, "bfloat16"),
         (
             lambda: OpacityDecay()(torch.tensor([1, 2]), 501),
             TypeError,

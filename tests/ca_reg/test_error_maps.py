@@ -76,13 +76,42 @@ def test_what_is_not_covered_is_expected_to_be_wrong():
     assert error[4, 9] > error[4, 2]
 
 
-def test_lists_go_with_a_renderer_of_another_layout():
-    opacity = torch.tensor([0.9, 0.4, 0.6])
+def test_moments_go_with_a_renderer_of_another_layout():
+    """Those of lists, others in this package's layout, and some in the renderer's own."""
+    opacity, lists = torch.tensor([0.9, 0.4, 0.6]), ListMoments(lists_fn)
     image, alpha = wall(opacity, None)
-    found = error_map(
-        lambda *_: (image.permute(1, 2, 0), alpha), opacity, None, moments_fn=ListMoments(lists_fn), layout="HWC"
-    )
-    assert torch.equal(found.error, error_map(wall, opacity, None, moments_fn=ListMoments(lists_fn)).error)
+
+    def turned(*given):
+        return {name: x.permute(1, 2, 0) for name, x in lists(*given)._asdict().items() if name != "alpha_mean"}
+
+    for moments in (lists, lambda *given: lists(*given), turned):
+        straight = lists if moments is turned else moments
+        expected = error_map(wall, opacity, None, moments_fn=(lambda *x: lists(*x)) if moments is turned else straight)
+        found = error_map(lambda *_: (image.permute(1, 2, 0), alpha), opacity, None, moments_fn=moments, layout="HWC")
+        assert torch.equal(found.error, expected.error)
+
+
+def test_a_color_divided_by_an_alpha_of_0_is_none():
+    def divided(opacity, view):
+        image, alpha = wall(opacity, view)
+        return image / alpha, alpha
+
+    def filled(opacity, view):
+        image, alpha = divided(opacity, view)
+        return image.nan_to_num(0.0), alpha
+
+    opacity = torch.tensor([0.9])
+    assert torch.equal(error_map(divided, opacity, None).error, error_map(filled, opacity, None).error)
+
+
+@pytest.mark.parametrize(("rendered", "message"), [
+    ((torch.rand(3, *SIZE) * 255, torch.ones(SIZE)), "divide by 255"),
+    ((torch.rand(3, *SIZE), torch.full(SIZE, 30.0)), "depth map"),
+    ((torch.full((3, *SIZE), torch.nan), torch.ones(SIZE)), "nan"),
+])  # fmt: skip
+def test_what_no_score_would_take_is_refused(rendered, message):
+    with pytest.raises(ValueError, match=message):
+        error_map(lambda opacity, view: rendered, torch.ones(2), None)
 
 
 def test_a_map_of_opacities_in_training_can_be_shown():

@@ -56,6 +56,15 @@ def test_draws_are_replayed_bit_for_bit_without_drawing():
     assert torch.equal(torch.get_rng_state(), before)
 
 
+def test_a_draw_is_compensated_for_the_rate_that_it_was_drawn_at():
+    dropout = GaussianDropout(LinearRamp(0.0, 0.5, 0, 10), compensate=True)
+    dropout.set_step(4)
+    first, draw = dropout(OPACITY), dropout.last
+    torch.testing.assert_close(first, OPACITY * draw.keep / 0.8)
+    dropout.set_step(10)
+    assert torch.equal(dropout(OPACITY, drawn=draw), first)
+
+
 def test_nothing_to_do_returns_the_same_tensor_and_no_draw():
     before = torch.get_rng_state()
     for module in (GaussianDropout(0.0), OpacityNoise(0.0), GaussianDropout(0.0).eval(), OpacityNoise(0.3).eval()):

@@ -375,3 +375,15 @@ def test_plot_without_matplotlib_names_the_extra(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.pyplot", None)
     with pytest.raises(ImportError, match=r"ca_reg\[plot\]"):
         CAScore(MANY)(MANY.opacity, None).plot()
+
+
+def test_a_score_made_or_reset_in_inference_mode_goes_on_outside():
+    """As in a validation by Lightning."""
+    opacity = torch.rand(60, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        score = CAScore(MANY, threshold=EVERYWHERE)
+        first = score.update(opacity, None)
+        score.reset()
+    score.update(opacity, None)
+    score.update(opacity, None, index=0)
+    assert score.compute().value == pytest.approx(first.value)

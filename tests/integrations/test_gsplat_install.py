@@ -7,12 +7,13 @@ from types import ModuleType
 import pytest
 import torch
 from stand_ins.gsplat import activated, rasterization, rasterization_that_culls_nothing, rasterization_without_radii
+from torch import nn
 
 from ca_reg import GaussianDropout
 from ca_reg.decay import OpacityDecay
 from ca_reg.integrations._report import Skip
 from ca_reg.integrations.gsplat import Installation, install
-from ca_reg.schedules import StartStop
+from ca_reg.schedules import LinearRamp, StartStop
 
 
 @pytest.fixture
@@ -98,6 +99,43 @@ def test_opacities_decay_after_their_own_optimizers_steps(fake_gsplat, params, c
     after = params["opacities"].detach().sigmoid()
     torch.testing.assert_close(after, 0.81 * before.pop("opacities").sigmoid(), rtol=1e-5, atol=0)
     assert all(torch.equal(params[name], x) for name, x in before.items())
+
+
+@pytest.mark.parametrize("trains", [False, True])
+def test_a_process_that_only_evaluates_is_past_its_schedule(fake_gsplat, params, cameras, trains):
+    seen = []
+    installation = install(GaussianDropout(LinearRamp(0.0, 0.5, 0, 10)))
+    for function in installation.functions.values():
+        inner = function.rasterization
+        function.rasterization = lambda *args, inner=inner, **named: seen.append(named["opacities"]) or inner(**named)
+    if trains:  # whose first step has a rate of 0, and whose second 0.05
+        for _ in range(2):
+            fake_gsplat.rasterization(**activated(params), **cameras)
+    with torch.no_grad():
+        fake_gsplat.rasterization(**activated(params), **cameras)
+    installation.uninstall()
+    torch.testing.assert_close(seen[-1], activated(params)["opacities"] * (0.95 if trains else 0.5))
+
+
+def test_a_model_in_evaluation_is_scaled_although_gradients_are_on(fake_gsplat, params, cameras):
+    """As nerfstudio's, whose losses are evaluated so."""
+
+    class Owner(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.splats = params
+
+        def forward(self):
+            return fake_gsplat.rasterization(**activated(self.splats), **cameras)
+
+    owner, renderer = Owner(), nn.Identity().eval()
+    with install(GaussianDropout(0.5)) as installation:
+        owner()
+        owner.eval()()
+        assert (installation.tally.regularized, installation.tally.scaled) == (1, 1)
+        renderer.forward = lambda self: fake_gsplat.rasterization(**activated(params), **cameras)
+        renderer.forward(renderer)  # a module in eval() whose parameters these are not
+        assert (installation.tally.regularized, installation.tally.scaled) == (2, 1)
 
 
 def test_a_block_installs_what_is_not(fake_gsplat):

@@ -380,6 +380,77 @@ def test_opacities_decay_after_the_steps_of_every_model(rasterizer):
     assert hook.tally.decayed == 4
 
 
+def test_a_resumed_training_decays_from_its_own_step_on(rasterizer, model_class):
+    model = model_class()
+    optimizer = optimizer_of(model)
+    before, decay = model._opacity.detach().sigmoid(), OpacityDecay(0.9, start=702)
+    for group in optimizer.param_groups:
+        group["lr"] = 0.0
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, decay=decay) as hook:
+        for step in range(701, 706):
+            model.update_learning_rate(step)
+            train(model, make_render(rasterizer), optimizer)
+    torch.testing.assert_close(model._opacity.detach().sigmoid(), before * 0.9**3)
+    assert hook.tally.decayed == 3
+
+
+class Twice(torch.optim.Adam):
+    """Torch tells its hooks of a step of this class twice."""
+
+    def step(self, closure=None):
+        return super().step(closure)
+
+
+def test_the_step_of_a_subclass_decays_once(rasterizer):
+    model = Model()
+    torch.optim.Adam([nn.Parameter(torch.zeros(1))])
+    optimizer = Twice([{"params": [model._opacity], "name": "opacity", "lr": 0.0}])
+    before = model._opacity.detach().sigmoid()
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, decay=OpacityDecay(0.9, start=0)) as hook:
+        for step in (1, 2):
+            hook.step(step)
+            train(model, make_render(rasterizer), optimizer)
+    torch.testing.assert_close(model._opacity.detach().sigmoid(), before * 0.81)
+
+
+def test_a_decay_of_opacities_that_are_not_rendered_is_an_error(rasterizer):
+    """As in Scaffold-GS, whose group of that name is not what its network makes opacities of."""
+    model, unused = Model(), nn.Parameter(torch.zeros(5, 1))
+    optimizer = torch.optim.Adam([
+        {"params": [unused], "name": "opacity"}, {"params": [*model.parameters()], "name": "mlp_opacity", "lr": 0.0},
+    ])  # fmt: skip
+    decay = OpacityDecay(0.9, start=0)
+    hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, decay=decay, patience=2).install()
+    for step in (1, 2):
+        hook.step(step)
+        train(model, make_render(rasterizer), optimizer)
+    assert not unused.any()
+    hook.step(3)
+    with pytest.raises(RuntimeError, match="no parameter group"):
+        train(model, make_render(rasterizer), optimizer)
+    hook.uninstall()
+
+
+def test_a_decay_that_never_begins_is_an_error(rasterizer):
+    model = Model()
+    hook = RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer, decay=OpacityDecay(start=1))
+    with hook:
+        for step in (1, 2):
+            hook.step(step)
+            train(model, make_render(rasterizer), optimizer_of(model))
+            assert (hook.problem() is None) == (step == 2)
+
+
+def test_a_render_without_gaussians_is_no_second_dropout(rasterizer):
+    model = Model()
+    for name in ("_xyz", "_scaling", "_rotation", "_opacity", "_features"):
+        setattr(model, name, nn.Parameter(getattr(model, name).detach()[:0]))
+    with RasterizerHook(GaussianDropout(0.5), rasterizer=rasterizer) as hook:
+        hook.step(1)
+        make_render(rasterizer)(model.camera, model, PIPE, BLACK)
+        assert hook.problem() is None
+
+
 def test_a_decay_that_finds_no_opacities_is_an_error(rasterizer):
     model = Model()
     optimizer = optimizer_of(model, name="mine")

@@ -11,8 +11,9 @@ import torch
 from stand_ins.gsplat import rasterization_1_4 as rasterization
 from torch import nn
 
-from ca_reg import CAScore, integrations
+from ca_reg import CAScore, GaussianDropout, integrations
 from ca_reg.integrations import _splatfacto, nerfstudio
+from ca_reg.integrations.gsplat import regularized
 
 N = 60
 ENTRY_POINT = "ca_reg.integrations.nerfstudio:splatfacto_ca"
@@ -117,6 +118,13 @@ def test_opacities_decay_from_the_step_on_at_which_density_control_begins():
     for step in range(5):  # nerfstudio's first step is 0: three before density control, two after
         model.decay_opacities(step)
     torch.testing.assert_close(activated(model), before * 0.9**2)
+
+
+def test_the_launchers_regularizer_beside_its_own_is_refused():
+    model, _ = make()
+    model.holder.rasterization = regularized(model.holder.rasterization.original, GaussianDropout(0.2))
+    with pytest.raises(ValueError, match="leave out --dropout"):
+        type(model)(model.config, model.holder)
 
 
 def test_evaluation_scales_the_opacities_and_masks_nothing():

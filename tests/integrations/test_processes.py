@@ -106,8 +106,15 @@ def test_a_process_that_cannot_be_hooked_is_named(command, changes, named):
         subprocess.run(
             [sys.executable, *command], env={**os.environ, **changes}, check=False, stdout=subprocess.DEVNULL
         )
-        subprocess.run(["true"], check=True)
+        subprocess.run(["true", "g++", "-I/usr/include/python3.11", "-I/opt", "x.cpp"], check=True)
     assert audit.missed == ([" ".join([sys.executable, *command])] if named else [])
+
+
+def test_the_last_model_and_the_last_ply_are_noticed(tmp_path):
+    with ScriptAudit() as audit:
+        for name in ("first.ply", "last.ply", "metrics.npz", "input.ply"):
+            (tmp_path / name).write_bytes(b"")
+    assert (audit.saved_ply, audit.saved) == (str(tmp_path / "last.ply"), str(tmp_path / "metrics.npz"))
 
 
 def test_a_sitecustomize_of_ones_own_still_runs(tmp_path, monkeypatch):

@@ -132,6 +132,15 @@ def test_rasterizers_within_packages_are_extensions_if_they_are_compiled(reposit
     assert set(found) == {"packages.a.raster", "packages.b.raster", "scene.built.raster"}
 
 
+def test_a_class_of_the_main_program_is_no_model(repository):
+    """No import shows it before it trains: changes of the parameters tell its steps."""
+    text = "class Model:\n    def update_learning_rate(self, iteration):\n        pass\n"
+    (repository / "single.py").write_text(text)
+    (repository / "other.py").write_text("import single\n")
+    assert read_script(repository / "single.py").models == []
+    assert read_script(repository / "other.py").models == ["single:Model"]
+
+
 def test_a_method_without_an_argument_does_not_tell_the_steps(repository):
     (repository / "trainer.py").write_text(
         "class Trainer:\n    def update_learning_rate(self):\n        pass\n"

@@ -30,6 +30,14 @@ def matrices(quaternions) -> np.ndarray:
     return Rotation.from_quat(quaternions.numpy()[:, [1, 2, 3, 0]]).as_matrix()  # scipy has xyzw
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_an_opacity_that_is_1_in_16_bits_does_not_drown_the_others(dtype):
+    x = params(12, step=4_000)
+    x = x._replace(opacities=x.opacities.index_fill(0, torch.tensor(3), 1.0).to(dtype))
+    noisy, exact = (SEGSNoise()(x._replace(opacities=o), generator=seeded(5)).opacities for o in (x[0], x[0].double()))
+    torch.testing.assert_close(noisy.double(), exact, rtol=0, atol=8 * torch.finfo(dtype).eps)
+
+
 def test_all_is_as_in_the_source():
     x, step = params(12, step=4_000), 4_000
     out = SEGSNoise()(x, generator=seeded(5))

@@ -46,6 +46,15 @@ def test_neighbors_are_sought_every_so_many_steps_and_when_the_number_changes(te
     assert looks == [40, 40, 40, 30, 30], "an earlier step is that of another training"
 
 
+def test_centers_that_an_optimizer_moves_behind_torchs_back_are_sought_again(looks):
+    """As kernels do, that write to the memory of a parameter."""
+    rule, means = _rule("density"), torch.nn.Parameter(cloud("spread"))
+    for step in range(1, 202, 10):
+        rule.regularize(params(means, step)._replace(means=means))
+        means.detach().numpy()[:] += 1e-3
+    assert looks == [40, 40, 40]
+
+
 @pytest.mark.parametrize("text", LOOKING)
 def test_another_model_of_as_many_gaussians_is_not_taken_for_the_last(text, looks):
     rule, first, second = _rule(text), params(cloud("spread")), params(cloud("duplicates"))
