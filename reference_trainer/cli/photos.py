@@ -9,6 +9,7 @@ import shutil
 import statistics
 import sys
 import webbrowser
+import zlib
 from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -130,10 +131,9 @@ class Run:
         if self.folder.resolve() in self.photos.resolve().parents:
             raise ValueError(f"the photographs are in {self.folder}, to which nothing is written: give another --out.")
         SceneOptions(test=self.test, points=self.points)  # refuses what no scene has
-        place = next(path for path in (self.folder.absolute(), *self.folder.absolute().parents) if path.exists())
-        if not place.is_dir() or not os.access(place, os.W_OK):
-            raise PermissionError(f"{self.folder} cannot be written to, because of {place}: give another --out.")
-        others = (MARK, run.SCENE, run.CONFIG, run.CHECKPOINT, run.PLY, run.RESULTS, run.VIEWS, run.COMPARISON)
+        others = (
+            MARK, run.SCENE, run.MEMBERS, run.CONFIG, run.CHECKPOINT, run.PLY, run.RESULTS, run.VIEWS, run.COMPARISON,
+        )  # fmt: skip
         run.check_output(self.folder, self.photos, () if self._mark() else others)
         run.report_file([self.folder])
 
@@ -160,10 +160,14 @@ class Run:
     def _photographs(self) -> Path:
         """Put the photographs in place, and return the folder of the scene: their own if they have cameras."""
         from reference_trainer.evaluation.results import write_json
+        from reference_trainer.scenes.formats import camera_files
         from reference_trainer.scenes.photographs import collect_photographs
 
         sources, scene = self._sources()
-        about: dict[str, Any] = {"frames": self.frames, "files": {path.name: path.stat().st_size for path in sources}}
+        files = {path.name: _checksum(path) for path in sources}
+        if scene == self.photos:
+            files |= {path.relative_to(scene).as_posix(): _checksum(path) for path in camera_files(scene)}
+        about: dict[str, Any] = {"frames": self.frames, "files": files}
         with run.run_lock(self.folder):
             if self.again != "photographs" and (place := self._in_place(about, scene)):
                 return place
@@ -195,7 +199,7 @@ class Run:
         with suppress(ValueError, FileNotFoundError):
             find_reader(self.photos, "auto")
             scene = self.photos
-        wrong |= {} if scene == self.photos else unread_folders(self.photos)
+        wrong |= {} if scene == self.photos else unread_folders(self.photos, self.folder)
         for name, why in wrong.items():
             print(f"left out: {'' if name in why else f'{name}: '}{why}", file=sys.stderr)
         if scene == self.photos:
@@ -226,8 +230,8 @@ class Run:
             changed.add("--frames")
         if changed:
             raise ValueError(
-                f"{self.folder} was made from other photographs, see {', '.join(sorted(changed))}: give another "
-                "--out, or begin again with --from photographs."
+                f"{self.folder} was made from other photographs or cameras, see {', '.join(sorted(changed))}: give "
+                "another --out, or begin again with --from photographs."
             )
         if scene == self.photos:
             return scene
@@ -425,3 +429,12 @@ def _duration(seconds: float) -> str:
         return f"{max(5, 5 * round(seconds / 5))} s"
     hours, minutes = divmod(round(seconds / 60), 60)
     return f"{hours} h {minutes} min" if hours else f"{minutes} min"
+
+
+def _checksum(path: Path) -> int:
+    """Return a number that changes with the content of a file."""
+    total = 0
+    with path.open("rb") as file:
+        while part := file.read(1 << 20):
+            total = zlib.crc32(part, total)
+    return total

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from reference_trainer.cli.options import Rendering, RenderOptions
+from reference_trainer.runs.folder import check_writable
 
 __all__ = ["Names", "Poses", "Recipes", "Version", "Warmup"]
 
@@ -34,6 +35,7 @@ class Poses:
     def check(self) -> None:
         if not self.photos.is_dir():
             raise FileNotFoundError(f"there is no folder {self.photos}: give the folder of the photographs.")
+        check_writable(self.out or self.photos)
 
     def __call__(self) -> None:
         # Imported here, as in every command: torch takes seconds, and neither --help nor a mistyped path should wait.

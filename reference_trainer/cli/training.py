@@ -15,7 +15,7 @@ import tyro
 
 from reference_trainer.cli.options import Device, Rendering, RenderOptions, check_scenes
 from reference_trainer.runs.executors import ExecutorName
-from reference_trainer.runs.folder import check_output, modules_named
+from reference_trainer.runs.folder import PLAN, check_output, is_own_plan, modules_named
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES
@@ -208,7 +208,9 @@ class Plan:
     def check(self) -> None:
         check_scenes([_chosen(self.scene, self.folder).path])
         # An earlier plan, known by its entry for the items, may be overwritten, and no other file.
-        if self.out is not None and self.out.exists() and '"items"' not in self.out.read_text("utf-8", "ignore"):
+        if self.out is not None and self.out.is_dir():
+            raise ValueError(f"{self.out} is a folder: --out is the file to write, such as {self.out / PLAN}.")
+        if self.out is not None and self.out.exists() and not is_own_plan(self.out):
             raise ValueError(f"{self.out} is no plan of ca-reg and is not overwritten: give another --out.")
 
     def __call__(self) -> None:

@@ -51,7 +51,7 @@ from reference_trainer.runs.folder import (
 )
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.poses import left_out
-from reference_trainer.scenes.scene import View, Viewpoint
+from reference_trainer.scenes.scene import Scene, View, Viewpoint
 from reference_trainer.scenes.virtual_cameras import interpolate_cameras
 from reference_trainer.training.config import TrainConfig
 
@@ -109,10 +109,11 @@ def write_report(
     for run, label in zip(runs, names, strict=True):
         _log.info("[%d/%d] %s", len(found) + 1, len(runs), run)
         found.append(find(run, label, views=views, device=device, trust=trust))
-        if found[-1].scene.name != found[0].scene.name:
+        if not _of_one_place(found[0].scene, found[-1].scene):
             raise ValueError(
                 f"a report is about one scene, whose models turn together, but {runs[0]} was trained on "
-                f"{found[0].scene.name} and {run} on {found[-1].scene.name}: write a report for each."
+                f"{found[0].scene.name} and {run} on {found[-1].scene.name}, or with other cameras: write a report for "
+                "each."
             )
     data = _data(dict(zip(names, runs, strict=True)), found, whole=set(runs) - set(folders))
     # The page names the command that makes it again, without what is usual.
@@ -173,8 +174,17 @@ def compare_two(first: Path, second: Path) -> tuple[list[dict[str, object]], lis
     notes = [f"Seeds: {counts[0]} and {counts[1]}; {rule}."]
     notes += [f"Not compared, because the views differ: {', '.join(sorted(other))}."] * bool(other)
     differing = _settings(dict(zip(names, configs.values(), strict=True)))[1]
+    paths = list(dict.fromkeys(scene.path for scene, _ in configs.values()))
+    notes += [f"Trained on {' and '.join(paths)}, which should be copies of one scene."] * (len(paths) > 1)
     notes += [f"Next to the regularizers, the runs differ in {', '.join(differing)}."] * bool(differing)
     return differences(*rows), notes
+
+
+def _of_one_place(first: Scene, second: Scene) -> bool:
+    """Whether two scenes have one name and, at the views that both train on, the same cameras."""
+    poses = [{view.name: view.camera.world_to_camera for view in scene.train} for scene in (first, second)]
+    shared = poses[0].keys() & poses[1].keys()
+    return first.name == second.name and all(poses[0][name].allclose(poses[1][name], atol=1e-4) for name in shared)
 
 
 def labels(runs: Sequence[Path]) -> list[str]:

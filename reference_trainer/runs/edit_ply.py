@@ -17,6 +17,7 @@ from reference_trainer.evaluation.tables import EXACT, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing
 from reference_trainer.model.ply import save_ply
+from reference_trainer.runs.folder import check_writable
 from reference_trainer.runs.ply import load_for_views, load_plain_ply_model, load_ply_model, log_other_frame, scaled
 from reference_trainer.runs.run import save_for_viewers
 from reference_trainer.scenes.options import OrbitOptions, SceneOptions
@@ -142,6 +143,9 @@ def clean_ply(
         raise ValueError(f"fraction must be in (0, 1) and refine at least 0, got {fraction} and {refine}.")
     if out.exists():
         raise FileExistsError(f"{out} exists already: give another --out, or delete it.")
+    if out.suffix.lower() in SMALL:
+        raise ValueError(f"a cleaned model is a PLY: clean to {out.with_suffix('.ply')}, and bake that to {out.name}.")
+    check_writable(out.parent)
     loaded = load_for_views(ply, where, background=background, regularizer=regularizer, device=device, trust=trust)
     model, scene = loaded.model, loaded.scene
     if model.for_rendering:

@@ -22,13 +22,14 @@ from reference_trainer.training.config import TrainConfig, saved_config
 
 __all__ = [
     "BAKED_PLY", "CHECKPOINT", "COMPARISON", "CONFIG", "GUARD", "GUARD_PICTURE", "LOCK", "MEMBERS", "PLAN", "PLY",
-    "RESULTS", "SCENE", "VIEWS", "FolderInUseError", "check_output", "check_run", "check_trusted", "folder_name",
-    "modules_named", "read_results", "read_run_settings", "report_file", "run_lock", "run_settings", "runs_of",
-    "settings_of_run",
+    "RESULTS", "SCENE", "VIEWS", "FolderInUseError", "check_output", "check_run", "check_trusted", "check_writable",
+    "folder_name", "is_own_plan", "modules_named", "read_results", "read_run_settings", "report_file", "run_lock",
+    "run_settings", "runs_of", "settings_of_run",
 ]  # fmt: skip
 
 CONFIG = "config.json"
 PLAN = "plan.json"
+LOG = "ca.jsonl"  # of a `CAMonitor`
 CHECKPOINT = "checkpoint.pt"
 PLY = "point_cloud.ply"
 BAKED_PLY = "point_cloud_for_viewers.ply"
@@ -109,7 +110,9 @@ def settings_of_run(
     if not (out / CONFIG).exists():
         if trained:
             raise ValueError(f"{out} holds a {CHECKPOINT} but no {CONFIG}: give another folder, or delete this one.")
-        check_output(out, options.path, (PLY, BAKED_PLY, RESULTS, GUARD, GUARD_PICTURE, VIEWS, COMPARISON))
+        # A run writes its plan first.
+        plan = () if is_own_plan(out / PLAN) else (PLAN,)
+        check_output(out, options.path, (*plan, LOG, PLY, BAKED_PLY, RESULTS, GUARD, GUARD_PICTURE, VIEWS, COMPARISON))
         return None
     if auto and (out / PLAN).exists():
         from reference_trainer.training.plan import Plan  # needs torch
@@ -136,14 +139,29 @@ def check_output(folder: Path, scene: str | Path | None, files: Collection[str])
     """Refuse to write into a folder of somebody else's, with a ValueError.
 
     That is the scene, the folder of the photographs, or one that holds ``files``, names of what would be overwritten
-    although nothing says that this program wrote it.
+    although nothing says that this program wrote it. Raises a PermissionError if nothing can be written there.
     """
-    if scene not in (None, "synthetic") and folder.exists() and folder.resolve() == Path(str(scene)).resolve():
+    check_writable(folder)
+    place = None if scene in (None, "synthetic") else Path(str(scene)).resolve()
+    pictures = re.fullmatch(r"images?(_\d+)?", folder.name) and folder.resolve().parent == place
+    if place is not None and folder.exists() and (folder.resolve() == place or pictures):
         raise ValueError(f"{folder} is the folder of the scene, to which nothing is written: give another --out.")
     if existing := [name for name in files if (folder / name).exists()]:
         raise ValueError(
             f"{folder} holds {', '.join(existing)}, but nothing says that this command wrote it: give another --out."
         )
+
+
+def is_own_plan(file: Path) -> bool:
+    """Whether a file is a plan of this program."""
+    return file.is_file() and '"items"' in file.read_text("utf-8", "ignore")
+
+
+def check_writable(folder: Path) -> None:
+    """Refuse a folder that cannot be written to, or made, with a PermissionError, before anything is computed."""
+    place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not place.is_dir() or not os.access(place, os.W_OK):
+        raise PermissionError(f"{folder} cannot be written to, because of {place}: give another --out.")
 
 
 def check_run(folder: Path) -> None:
@@ -157,6 +175,8 @@ def check_run(folder: Path) -> None:
     found = f"{folder} holds no run (no {CONFIG}): give the --out folder of ca-reg train"
     if not folder.exists():
         found = f"{folder} holds no run: there is no such folder; give the --out folder of ca-reg train"
+    elif folder.suffix.lower() == ".ply":
+        found = f"{folder} is a PLY, which knows no cameras: give the --out folder of ca-reg train"
     elif folder.is_file():
         found = f"{folder} is neither a run nor a PLY: give the --out folder of ca-reg train, or a standard 3DGS .ply"
         if folder.suffix.lower() in (".pt", ".pth", ".ckpt"):
@@ -191,6 +211,7 @@ def report_file(runs: Sequence[Path], out: Path | None = None) -> Path:
     if out is not None and out.is_dir():
         raise ValueError(f"{out} is a folder: --out is the file to write, such as {out / 'report.html'}.")
     file = out or Path(os.path.commonpath([run.absolute() for run in runs])) / "report.html"
+    check_writable(file.parent)
     if file.exists():
         with file.open("rb") as content:
             if _OWN_PAGE not in content.read(1_000):

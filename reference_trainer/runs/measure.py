@@ -73,8 +73,8 @@ def measure(
         ValueError: if ``out`` holds files of these names that are not from here.
     """
     # A folder with an earlier measurement is ours; in any other, files of these names are somebody else's.
-    if not ((out / EVALUATION).exists() or (out / PARTIAL).exists()):
-        check_output(out, None, ("evaluation.md", VIEWS))
+    ours = (out / PARTIAL).exists() or _is_evaluation(out / EVALUATION)
+    check_output(out, None, () if ours else (EVALUATION, "evaluation.md", VIEWS))
     partial = out / PARTIAL
     largest = max(view.camera.width * view.camera.height for of in views.values() for view in of)
     with run_lock(out), threads_for(largest):
@@ -97,6 +97,11 @@ def measure(
     _log.info(table)
     _log.info("Scores and pictures are in %s", out)
     return result
+
+
+def _is_evaluation(file: Path) -> bool:
+    """Whether a file is an evaluation of this program."""
+    return file.is_file() and '"ca_settings"' in file.read_text("utf-8", "ignore")
 
 
 def _remove_other_pictures(folder: Path, views: Mapping[str, Sequence[Viewpoint]]) -> None:
@@ -151,7 +156,9 @@ def render_run(
     folder, names = out or run / f"render_{what}", file_names([view.name for view in views])
     endings = ["", *(["_error"] if what == "error" else []), *(["_mask"] if mask is not None else [])]
     files = [f"{name}{end}.png" for name in names for end in endings]
-    check_output(folder, None, [file for file in files if not is_own_png(folder / file)])
+    flown = (folder / files[0]).exists()  # the film of an earlier flight is beside its pictures
+    films = ["flight.mp4", "flight.webp"] if what == "flight" and not flown else []
+    check_output(folder, None, [*(file for file in files if not is_own_png(folder / file)), *films])
     maps = ErrorMaps(model, scene.train) if what == "error" else None
     images = []
     for name, view in zip(names, views, strict=True):

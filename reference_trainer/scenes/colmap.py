@@ -8,10 +8,12 @@ from typing import Any
 from reference_trainer.scenes._colmap_model import READERS, ColmapModel, PointRecords
 from reference_trainer.scenes.formats import Capture, SceneFormat
 from reference_trainer.scenes.frames import Frame
-from reference_trainer.scenes.images import image_folder, match_images
+from reference_trainer.scenes.images import image_folder, list_images, match_images
 from reference_trainer.scenes.options import SceneOptions
 
 __all__ = ["COLMAP", "colmap_folders", "colmap_frames", "is_colmap", "read_colmap"]
+
+_NAMED = 5  # photographs without a camera
 
 
 def read_colmap(folder: str | Path) -> ColmapModel:
@@ -87,7 +89,12 @@ def _has(folder: Path, stem: str) -> bool:
 def _read_scene(root: Path, options: SceneOptions) -> Capture:
     """Read a scene folder."""
     folder = (colmap_folders(root) or [root / "sparse" / "0"])[0]  # the fallback's error says what is missing
-    return Capture(colmap_frames(read_colmap(folder), image_folder(root, options.images)))
+    pictures = image_folder(root, options.images)
+    frames = colmap_frames(read_colmap(folder), pictures)
+    placed = {frame.path for frame in frames}
+    others = [path.name for path in list_images(pictures) if path not in placed]
+    shown = ", ".join([*others[:_NAMED], *["..."] * (len(others) > _NAMED)])
+    return Capture(frames, note=f"no camera, and not used: {shown}" * bool(others))
 
 
 COLMAP = SceneFormat(

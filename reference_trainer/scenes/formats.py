@@ -17,7 +17,9 @@ from reference_trainer.scenes.images import is_image
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.scene import PointCloud
 
-__all__ = ["FORMATS", "Capture", "Reader", "SceneFormat", "find_reader", "only_default", "register_format"]
+__all__ = [
+    "FORMATS", "Capture", "Reader", "SceneFormat", "camera_files", "find_reader", "only_default", "register_format",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class Capture:
             that holds lists as a split file does.
         views: the default number of training views.
         background: ``"black"`` or ``"white"``, behind transparent pictures.
+        note: what a user should know.
     """
 
     frames: list[Frame]
@@ -40,6 +43,7 @@ class Capture:
     split: str = "llff"
     views: int = 3
     background: str = "black"
+    note: str = ""
 
 
 Reader = Callable[[Path, SceneOptions], Capture]
@@ -124,3 +128,9 @@ def only_default(format: str, **options: object) -> None:
     given = {name: value for name, value in options.items() if value not in (None, "auto")}
     if given:
         raise ValueError(f"a {format} scene has no use for {given}; leave them out.")
+
+
+def camera_files(root: Path) -> list[Path]:
+    """Return the files of a scene folder from which cameras are read, of the usual formats."""
+    kinds = ("sparse*/**/cameras.*", "sparse*/**/images.*", "transforms*.json", "poses_bounds.npy", "cameras*.npz")
+    return sorted(path for kind in kinds for path in root.glob(kind) if path.is_file())

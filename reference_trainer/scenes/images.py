@@ -176,8 +176,9 @@ def unreadable_photographs(folder: Path) -> list[str]:
 def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
     """Find the file of each named image in a folder, possibly of resized copies.
 
-    Files are matched by relative path, else by name without extension, else, if there are as many files as names, by
-    sorted order, which is how the LLFF data set relates ``images_8/image000.png`` to ``images/IMG_4026.JPG``.
+    Files are matched by relative path, else by name without extension, else, if there are as many files as names and
+    none has a name in common, by sorted order, which is how the LLFF data set relates ``images_8/image000.png`` to
+    ``images/IMG_4026.JPG``.
 
     Raises:
         FileNotFoundError: if there is no such folder.
@@ -192,12 +193,15 @@ def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
     unique = len(by_stem) == len(files) and len(set(stems.values())) == len(names)  # not so for two folders of cameras
     if unique and by_stem.keys() >= set(stems.values()):
         return {name: by_stem[stem] for name, stem in stems.items()}
-    if len(files) == len(names):
+    common = by_stem.keys() & set(stems.values())
+    if len(files) == len(names) and not common:
         return dict(zip(sorted(names), files, strict=True))
-    missing = [name for name in names if not paths[name].is_file()]
+    missing = [name for name in names if not paths[name].is_file() and stems[name] not in common]
+    others = [file.name for file in files if file.stem not in common]
     raise ValueError(
         f"{folder} lacks {len(missing)} of the {len(names)} images of the scene, such as {missing[:3]}; it holds "
-        f"{len(files)} files, such as {[file.name for file in files[:3]]}. Choose another image folder."
+        f"{len(files)} files, such as {(others or [file.name for file in files])[:3]}. Choose another image folder; "
+        "photographs that were renamed need their names of before, new ones that their cameras are found anew."
     )
 
 

@@ -116,7 +116,11 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
         start=start,
         background=color,
         source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
-        notes=tuple(filter(None, (about_unread, about_size, about_lenses, about_masks, about_points, about_exposure))),
+        notes=tuple(
+            filter(
+                None, (about_unread, capture.note, about_size, about_lenses, about_masks, about_points, about_exposure)
+            )
+        ),
     )
 
 

@@ -95,15 +95,23 @@ def sort_photographs(source: Path) -> tuple[list[Path], dict[str, str]]:
     return sorted(usable), wrong
 
 
-def unread_folders(source: Path) -> dict[str, str]:
+def unread_folders(source: Path, own: Path) -> dict[str, str]:
     """Return what to do about photographs, down to two levels, that `sort_photographs` does not read, by folder.
 
-    Only their owner knows which are of one place.
+    Only their owner knows which are of one place. What lies in ``own``, the folder of a run, or is called masks, is no
+    photograph.
     """
     read = photograph_folder(source, _KINDS)
     found = (path for pattern in ("*", "*/*", "*/*/*") for path in source.glob(pattern) if path.parent != read)
     shown = (path for path in found if not any(part[0] == "." for part in path.relative_to(source).parts))
-    held = Counter(path.parent for path in shown if path.suffix.lower() in _KINDS and path.is_file())
+    held = Counter(
+        path.parent
+        for path in shown
+        if path.suffix.lower() in _KINDS
+        and path.is_file()
+        and not path.resolve().is_relative_to(own.resolve())
+        and path.parent.name.lower() not in ("mask", "masks")
+    )
     return {
         str(folder): f"{number} photographs or videos in {folder} are not read: move them to {read}"
         + ", or give their folder instead" * (folder != source)

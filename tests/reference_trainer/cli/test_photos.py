@@ -116,7 +116,9 @@ def test_three_photographs_become_a_page(garden, tmp_path, capsys, monkeypatch):
     refused(["run", "garden", "--quick", "--from", "evaluate"], capsys)
     assert seen(out) == there
     (garden / "train_2.png").unlink()
-    assert "other photographs, see train_2.png" in refused(["run", "garden"], capsys)
+    assert "cameras, see train_2.png" in refused(["run", "garden"], capsys)
+    shutil.copy(garden / "train_1.png", garden / "train_2.png")  # maybe of as many bytes
+    assert "cameras, see train_2.png" in refused(["run", "garden"], capsys)
     shutil.copy(out / "scene/garden/images/train_2.png", garden)
     main(["run", "garden", "--quick", "--from", "train", "--no-open"])
     assert json.loads((out / "config.json").read_text())["config"]["iterations"] == 2
@@ -219,6 +221,8 @@ def test_a_model_that_cannot_be_trained_is_named(garden, tmp_path, capsys, monke
     for number in "01":
         (foreign := tmp_path / "out/members" / number / "results.json").parent.mkdir(parents=True)
         foreign.write_text("{}")
+    (tmp_path / "out" / photos.MARK).write_text('{"frames": 16, "files": {}}')
+    monkeypatch.setattr(photos.Run, "_in_place", lambda self, about, scene: scene)
     said = refused(["run", "garden", "--out", "out", "--members", "2"], capsys)
     assert "model 1 failed" in said
     assert "members/0 holds results.json, but nothing says" in said
@@ -239,6 +243,15 @@ def test_photographs_with_cameras_stay_where_they_are(garden, tmp_path, monkeypa
         assert view.size == (28, 21)
     assert np.isfinite(json.loads((tmp_path / "out" / "results.json").read_text())["mean"]["train"]["psnr"])
 
+    # Another photograph has no camera; other cameras are another scene.
+    save_png(garden / "train_9.png", SCENE.test[0].image)
+    assert "see train_9.png" in refused(["run", "garden", "--out", "out", "--quick"], capsys)
+    main(["plan", "garden"])
+    assert "no camera, and not used: train_9.png" in capsys.readouterr().out
+    (garden / "train_9.png").unlink()
+    (cameras := garden / "sparse/0/images.txt").write_text(cameras.read_text().replace("1 ", "1  ", 1))
+    assert "see sparse/0/images.txt" in refused(["run", "garden", "--out", "out", "--quick"], capsys)
+
 
 @pytest.mark.slow
 def test_cameras_are_found_by_a_new_process(garden):
@@ -254,7 +267,7 @@ def test_cameras_are_found_by_a_new_process(garden):
 
 @pytest.mark.parametrize(
     ("name", "content"),
-    [("point_cloud.ply", "ply"), ("report.html", "<p>mine"), ("scene", None), ("views", None)]
+    [("point_cloud.ply", "ply"), ("report.html", "<p>mine"), ("scene", None), ("views", None), ("members", None)]
     + [
         ("photographs.json", text)
         for text in ('{"a": 1}', '{"files": 3}', '{"frames": 2, "files": []}', "[]", "null", "")

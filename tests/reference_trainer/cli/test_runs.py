@@ -216,6 +216,12 @@ def test_what_would_be_lost_is_refused(trained, capsys, tmp_path):
     garden = str(tmp_path)
     assert "folder of the scene" in refused(["train", garden, "--out", garden], capsys)
     assert "is no plan of ca-reg" in refused(["plan", "--out", str(tmp_path / "plan.json")], capsys)
+    assert "is a folder" in refused(["plan", "--out", garden], capsys)
+    assert "holds plan.json" in refused(["train", "--out", garden, *SMALL], capsys)
+    assert "which knows no cameras" in refused(["render", str(trained / "point_cloud.ply")], capsys)
+    assert "bake that" in refused(["clean", str(trained / "point_cloud.ply"), "--anyway", "--out", "x.spz"], capsys)
+    (tmp_path / "evaluation.json").write_text("{}")
+    assert "holds evaluation.json" in refused(["evaluate", str(trained), "--out", garden], capsys)
     assert "holds test_0.png" in refused(["render", str(trained), "--what", "test", "--out", garden], capsys)
     assert (tmp_path / "test_0.png").read_text() == "a photograph"
     for what in ("auto", "train", "error"):

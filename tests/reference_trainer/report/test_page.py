@@ -246,6 +246,11 @@ def test_what_is_no_run_or_no_pair_is_refused(run, found, tmp_path, monkeypatch)
     with pytest.raises(ValueError, match=r"one scene.*synthetic.*elsewhere"):
         write_report([run[0], tmp_path / "other"], tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
+    first, *others = found.scene.train  # a place of the same names
+    moved = dataclasses.replace(first, camera=found.scene.test[0].camera)
+    elsewhere = dataclasses.replace(found, scene=dataclasses.replace(found.scene, train=(moved, *others)))
+    with pytest.raises(ValueError, match="other cameras"):
+        write_report([run[0], tmp_path / "other"], tmp_path / "page.html")
 
 
 def strategies(found, folders, tmp_path, monkeypatch) -> dict:

@@ -1,10 +1,11 @@
 """The folder of a run: where its scene is found."""
 
 import json
+import os
 
 import pytest
 
-from reference_trainer.runs.folder import CONFIG, read_run_settings, run_settings
+from reference_trainer.runs.folder import CONFIG, check_output, read_run_settings, report_file, run_settings
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
 
@@ -19,3 +20,21 @@ def test_a_scene_in_the_folder_of_the_run_is_found_where_that_is_now(trained_on,
     settings = run_settings(SceneOptions(str(tmp_path / trained_on)), TrainConfig())
     (tmp_path / "moved" / CONFIG).write_text(json.dumps(settings))
     assert read_run_settings(tmp_path / "moved" / CONFIG)[0].path == str(tmp_path / found)
+
+
+def test_where_nothing_can_be_written_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path / "mine")  # root may write anywhere
+    (tmp_path / "mine").mkdir()
+    for folder in (tmp_path / "mine", tmp_path / "mine" / "of" / "tomorrow"):
+        with pytest.raises(PermissionError, match="another --out"):
+            check_output(folder, None, ())
+        with pytest.raises(PermissionError, match="another --out"):
+            report_file([tmp_path], folder / "report.html")
+    check_output(tmp_path / "new", None, ())
+
+
+def test_the_folder_of_the_photographs_is_no_output(tmp_path):
+    (tmp_path / "images_2").mkdir()
+    with pytest.raises(ValueError, match="folder of the scene"):
+        check_output(tmp_path / "images_2", tmp_path, ())
+    check_output(tmp_path / "runs", tmp_path, ())

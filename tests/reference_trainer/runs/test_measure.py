@@ -212,6 +212,10 @@ def test_a_flight_begins_and_ends_at_training_cameras(suffix, run, tmp_path, sai
     (folder / "0006.png").write_bytes(b"somebody else's")
     render_run(out, "flight", folder, frames=4)  # nothing is left of the longer one
     assert sorted(folder.iterdir()) == [*pictures[:4], folder / "0006.png", film]
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / film.name).write_bytes(b"of another program")
+    with pytest.raises(ValueError, match="holds flight"):
+        render_run(out, "flight", tmp_path / "mine", frames=2)
 
 
 def test_where_a_run_is_expected_to_be_wrong(run, tmp_path):

@@ -106,6 +106,13 @@ def test_match_images_by_name_stem_and_order(tmp_path):
         match_images(tmp_path / "a", ["IMG_1.JPG", "IMG_2.JPG"])
 
 
+def test_a_renamed_photograph_is_not_paired_with_another_camera(tmp_path):
+    """By order all three would be."""
+    touch(tmp_path / "a", "IMG_4.JPG", "IMG_6.JPG", "portal.JPG")
+    with pytest.raises(ValueError, match=r"lacks 1 .*IMG_2\.JPG.*portal\.JPG"):
+        match_images(tmp_path / "a", ["IMG_2.JPG", "IMG_4.JPG", "IMG_6.JPG"])
+
+
 def test_photographs_of_one_name_in_two_folders_are_not_one_file(tmp_path, save_image):
     for number in range(3):
         save_image(tmp_path / "small" / f"{number}.png", np.zeros((2, 2, 3), np.uint8))

@@ -130,12 +130,13 @@ def test_rare_endings_are_read_and_what_is_no_photograph_is_named(tmp_path):
 
 
 def test_photographs_in_other_folders_are_named(tmp_path):
-    for folder in ("DCIM/100", "DCIM/101", ".trash", "notes"):
+    for folder in ("DCIM/100", "DCIM/101", ".trash", "notes", "masks", "out/render_flight"):
         (tmp_path / folder).mkdir(parents=True)
-    for name in ("DCIM/100/a.jpg", "DCIM/100/b.jpg", "DCIM/101/c.jpg", ".trash/d.jpg"):
+    hidden = (".trash/d.jpg", "masks/a.jpg", "out/render_flight/0000.png")
+    for name in ("DCIM/100/a.jpg", "DCIM/100/b.jpg", "DCIM/101/c.jpg", *hidden):
         saved(tmp_path / name, picture())
     (tmp_path / "notes" / "e.txt").touch()
-    found = unread_folders(tmp_path)
+    found = unread_folders(tmp_path, tmp_path / "out")
     assert found.keys() == {str(tmp_path / "DCIM/100"), str(tmp_path / "DCIM/101")}
     said = found[str(tmp_path / "DCIM/100")]
     assert said.startswith(
@@ -148,10 +149,10 @@ def test_a_folder_images_counts_only_if_pictures_are_there(tmp_path):
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "notes.txt").touch()
     assert sort_photographs(tmp_path)[0] == [outside]
-    assert not unread_folders(tmp_path)
+    assert not unread_folders(tmp_path, tmp_path / "out")
     inside = saved(tmp_path / "images" / "b.jpg", picture())
     assert sort_photographs(tmp_path)[0] == [inside]
-    assert f"move them to {inside.parent}" in unread_folders(tmp_path)[str(tmp_path)]
+    assert f"move them to {inside.parent}" in unread_folders(tmp_path, tmp_path / "out")[str(tmp_path)]
 
 
 def test_transparency_stays(tmp_path):
