@@ -42,7 +42,7 @@ class Evaluate:
     trust: Trust = ()
     device: Device = "cpu"
     out: Path | None = None
-    """Folder for the results; by default <run>/evaluation, <run>/evaluation_<regularizer> or <ply>_evaluation."""
+    """Folder for the results; by default <run>/evaluation or <ply>_evaluation, with _orbit or _<regularizer> behind."""
     rendering: Rendering = field(default_factory=RenderOptions)
 
     def check(self) -> None:

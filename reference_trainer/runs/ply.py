@@ -22,7 +22,7 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.ply import load_ply
 from reference_trainer.render.constants import MIN_ALPHA, NEAR_PLANE
-from reference_trainer.runs.folder import VIEWS, check_trusted
+from reference_trainer.runs.folder import VIEWS, check_trusted, folder_name
 from reference_trainer.runs.guarded import log_what_hangs
 from reference_trainer.runs.measure import measure
 from reference_trainer.scenes import load_scene
@@ -183,16 +183,19 @@ def score_ply(
     """Measure the model of a PLY at the views of a scene or on an orbit; writes and prints what `measure` does.
 
     For a scene the model is in the frame of its cameras, for an orbit in any frame and of any size; an orbit has a
-    background, ``"black"`` (the default) or ``"white"``, a scene its own. Results go to ``out``, ``<ply>_evaluation``
-    by default. ``regularizer`` and ``trust`` are as in `load_ply_model`, ``samples``, ``seed`` and ``perceptual`` as in
-    `evaluate`.
+    background, ``"black"`` (the default) or ``"white"``, a scene its own. Results go to ``out``, by default to
+    ``<ply>_evaluation``, with ``_orbit`` and the regularizer behind it if they are given. ``regularizer`` and
+    ``trust`` are as in `load_ply_model`, ``samples``, ``seed`` and ``perceptual`` as in `evaluate`.
 
     Raises:
         ValueError: from `load_ply_model`, `check_frame` or `orbit_views`, or if the background is unknown.
         FileNotFoundError: if the PLY or the scene is missing.
     """
     loaded = load_for_views(ply, where, background=background, regularizer=regularizer, device=device, trust=trust)
-    folder, scene = out or ply.with_name(ply.stem + "_evaluation"), loaded.scene
+    scene = loaded.scene
+    # Folders of their own, or the scores at other views or of another regularizer would take each other's place.
+    kind = ["orbit"] * (scene is None) + [folder_name(x) for x in (regularizer,) if x is not None]
+    folder = out or ply.with_name("_".join([ply.stem, "evaluation", *kind]))
     shared: dict[str, Any] = {"samples": samples, "seed": seed, "perceptual": perceptual}
     result = measure(loaded.model, loaded.views, folder, about=loaded.about, **shared)
     log_what_hangs(loaded.model, scene, folder)

@@ -161,7 +161,7 @@ def test_an_orbit_and_a_baked_ply(trained, capsys, tmp_path):
     ply = str(trained / "point_cloud.ply")
     main(["evaluate", ply, "--out", str(tmp_path / "p"), *small])
     one, other = (
-        json.loads((tmp_path / folder / "evaluation.json").read_text()) for folder in ("baked_evaluation", "p")
+        json.loads((tmp_path / folder / "evaluation.json").read_text()) for folder in ("baked_evaluation_orbit", "p")
     )
     assert one["mean"]["orbit"]["covered"] > 0
     for name in ("covered", "cv"):  # after three steps nothing is opaque enough for CA
