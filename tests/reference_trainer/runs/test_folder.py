@@ -35,6 +35,6 @@ def test_where_nothing_can_be_written_is_refused_before_anything_is_computed(tmp
 
 def test_the_folder_of_the_photographs_is_no_output(tmp_path):
     (tmp_path / "images_2").mkdir()
-    with pytest.raises(ValueError, match="folder of the scene"):
+    with pytest.raises(ValueError, match="of the scene"):
         check_output(tmp_path / "images_2", tmp_path, ())
     check_output(tmp_path / "runs", tmp_path, ())
