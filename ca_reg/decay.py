@@ -49,7 +49,7 @@ class OpacityDecay:
             step: the number of the optimizer step that was made last.
 
         Raises:
-            TypeError: if the logits are no floating-point tensor.
+            TypeError: if the logits are no floating-point tensor, or of bfloat16.
         """
         if step > self.start:
             decayed = decayed_logits(logits, self.factor)

@@ -207,6 +207,7 @@ def report_file(runs: Sequence[Path], out: Path | None = None) -> Path:
 
     Raises:
         ValueError: if it is a folder, or a file that is no report of this program.
+        PermissionError: if nothing can be written there.
     """
     if out is not None and out.is_dir():
         raise ValueError(f"{out} is a folder: --out is the file to write, such as {out / 'report.html'}.")

@@ -89,10 +89,10 @@ def _has(folder: Path, stem: str) -> bool:
 def _read_scene(root: Path, options: SceneOptions) -> Capture:
     """Read a scene folder."""
     folder = (colmap_folders(root) or [root / "sparse" / "0"])[0]  # the fallback's error says what is missing
-    pictures = image_folder(root, options.images)
-    frames = colmap_frames(read_colmap(folder), pictures)
-    placed = {frame.path for frame in frames}
-    others = [path.name for path in list_images(pictures) if path not in placed]
+    frames = colmap_frames(read_colmap(folder), image_folder(root, options.images))
+    placed = {frame.path for frame in frames}  # maybe in folders of their own, one for each camera
+    beside = (path for folder in sorted({path.parent for path in placed}) for path in list_images(folder))
+    others = [path.name for path in beside if path not in placed]
     shown = ", ".join([*others[:_NAMED], *["..."] * (len(others) > _NAMED)])
     return Capture(frames, note=f"no camera, and not used: {shown}" * bool(others))
 

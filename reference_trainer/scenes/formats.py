@@ -132,5 +132,11 @@ def only_default(format: str, **options: object) -> None:
 
 def camera_files(root: Path) -> list[Path]:
     """Return the files of a scene folder from which cameras are read, of the usual formats."""
-    kinds = ("sparse*/**/cameras.*", "sparse*/**/images.*", "transforms*.json", "poses_bounds.npy", "cameras*.npz")
+    colmap = [
+        f"{place}{name}.{kind}"
+        for place in ("", "sparse*/**/")
+        for name in ("cameras", "images")
+        for kind in ("bin", "txt")
+    ]
+    kinds = (*colmap, "transforms*.json", "poses_bounds.npy", "cameras*.npz")
     return sorted(path for kind in kinds for path in root.glob(kind) if path.is_file())

@@ -193,7 +193,7 @@ def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
     unique = len(by_stem) == len(files) and len(set(stems.values())) == len(names)  # not so for two folders of cameras
     if unique and by_stem.keys() >= set(stems.values()):
         return {name: by_stem[stem] for name, stem in stems.items()}
-    common = by_stem.keys() & set(stems.values())
+    common = by_stem.keys() & set(stems.values()) if unique else set[str]()
     if len(files) == len(names) and not common:
         return dict(zip(sorted(names), files, strict=True))
     missing = [name for name in names if not paths[name].is_file() and stems[name] not in common]

@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -31,6 +32,21 @@ def photo_scene(tmp_path, colmap_text, save_image):
         save_image(root / "images_4" / f"{name}.png", pixels[::4, ::4].copy())
     (root / "split.json").write_text(json.dumps({"train": ["b.png", "c.png"], "test": ["a b.png"]}))
     return root
+
+
+def test_photographs_without_a_camera_are_named_also_in_folders_of_their_cameras(photo_scene, save_image):
+    (photo_scene / "split.json").unlink()
+    options = SceneOptions(photo_scene, images="images", points="random:5", test="none")
+    assert "no camera" not in str(load_scene(options))
+    (photo_scene / "images").rename(photo_scene / "moved")
+    (photo_scene / "images").mkdir()
+    (photo_scene / "moved").rename(photo_scene / "images/left")
+    (listed := photo_scene / "sparse/0/images.txt").write_text(
+        re.sub(r"^(\S+ (?:\S+ ){7}\d+) (.*png)$", r"\1 left/\2", listed.read_text(), flags=re.MULTILINE)
+    )
+    assert "no camera" not in str(load_scene(options))
+    save_image(photo_scene / "images/left/new.png", np.zeros((48, 64, 3), np.uint8))
+    assert "not used: new.png" in str(load_scene(options))
 
 
 def test_colmap_scene(photo_scene):
