@@ -16,7 +16,18 @@ import numpy as np
 from scipy.stats import binomtest, spearmanr
 
 from benchmarks.paper.rows import value
-from benchmarks.setting import CHOSEN, DENSE, FEWEST, LATER, REFERENCES, Row, references_of, rows_of
+from benchmarks.setting import (
+    BINOCULAR,
+    CHOSEN,
+    DENSE,
+    FEWEST,
+    LATER,
+    REFERENCES,
+    RELATIVE,
+    Row,
+    references_of,
+    rows_of,
+)
 from benchmarks.start_scenes import from_dense
 from reference_trainer.evaluation.tables import markdown_table, mean_std
 
@@ -26,8 +37,11 @@ FAILURE = 1.0
 """A training so many dB below the median of its scene and setting has failed."""
 PLAIN_DENSE = "plain, dense start"
 """What a user would have without the recipe."""
-DROPOUT_DENSE = "dropout, dense start"
-"""What the two lines of the README give."""
+FROM_DENSE = {LATER: DENSE, "plain": PLAIN_DENSE} | {
+    name: f"{name.removesuffix(RELATIVE)}, dense start"
+    for name in ("dropout", "noise", "expectation", f"{BINOCULAR}{RELATIVE}")
+}
+"""The settings of the study from the start that a user has, by the names of their rows."""
 FAILING = ("herz-jesu", "fountain", "dtu-scan65", "sceaux")
 """The scenes of the study."""
 PREDICTED = (13, 14, 15)
@@ -39,8 +53,7 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     lines, counts, ahead = [], dict[str, list[bool]](), dict[str, list[float]]()
     for scene in FAILING:
         dense = from_dense(scene)
-        every = {DENSE: rows_of(rows, dense, LATER), PLAIN_DENSE: rows_of(rows, dense, "plain")}
-        every |= {DROPOUT_DENSE: rows_of(rows, dense, "dropout")}
+        every = {label: rows_of(rows, dense, name) for name, label in FROM_DENSE.items()}
         every |= {name: rows_of(rows, scene, name) for name in (LATER, CHOSEN)}
         every |= references_of(rows, references, scene)
         figures = {
@@ -57,7 +70,8 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
                 "standard deviation": f"{mean_std(of.values())[1]:.2f}", "worst": f"{worst:.2f}",
                 "to the median": f"{worst - middle:+.2f}", "failures": str(sum(failed)),
             })  # fmt: skip
-        for name, other in ((DENSE, PLAIN_DENSE), (DROPOUT_DENSE, PLAIN_DENSE), (LATER, "plain"), (CHOSEN, "plain")):
+        pairs = [(label, PLAIN_DENSE) for label in FROM_DENSE.values() if label != PLAIN_DENSE]
+        for name, other in (*pairs, (LATER, "plain"), (CHOSEN, "plain")):
             own, plain = (figures.get(x, {}) for x in (name, other))
             ahead.setdefault(name, []).extend(own[seed] - plain[seed] for seed in own.keys() & plain.keys())
     if not lines:
