@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, TypeVar
 
-__all__ = ["Registry", "imported"]
+__all__ = ["Registry", "imported", "modules"]
 
 T = TypeVar("T")
 _Factory = TypeVar("_Factory", bound=Callable[..., Any])
@@ -96,19 +96,11 @@ class Registry(Generic[T]):
             ValueError: if the text does not parse, a name is unknown, or an argument is rejected.
         """
         text = text.strip()
-        if not text:
-            return []
-        # Turn module:Class into module.Class, which Python can parse, outside string literals; {1:True} stays.
-        source = re.sub(r"""('[^']*'|"[^"]*")|([A-Za-z_][\w.]*):(?=[A-Za-z_])""", lambda x: x[1] or f"{x[2]}.", text)
         try:
-            node: ast.expr = ast.parse(source, mode="eval").body
+            terms = _terms(text)
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise ValueError(f"{text!r:.200} cannot be read as {self.kind}s: {error}; {self._form()}") from error
-        terms: list[ast.expr] = []
-        while isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
-            terms.insert(0, node.right)
-            node = node.left
-        return [self._make(term, text, imports) for term in [node, *terms]]
+        return [self._make(term, text, imports) for term in terms]
 
     def make_one(self, text: str) -> T:
         """Make the object of an expression that has exactly one.
@@ -123,9 +115,8 @@ class Registry(Generic[T]):
     def _make(self, node: ast.expr, text: str, imports: bool) -> T:
         """Make one object."""
         call = node if isinstance(node, ast.Call) else ast.Call(node, [], [])  # a bare name stands for a call
-        if not re.fullmatch(r"[A-Za-z_][\w.:]*", name := _written(call.func, text)):
+        if not (name := _name(node, text)):
             raise ValueError(f"{_written(node, text)!r:.80} in {text!r:.200} is no {self.kind}; {self._form()}")
-        name = name.replace(":", ".")
         if "." in name and not imports:
             raise ValueError(f"{name} in {text!r:.200} is not imported because a file says so: give it yourself.")
         factory = self[name]
@@ -157,6 +148,43 @@ class Registry(Generic[T]):
     def _form(self) -> str:
         example = f"{next(iter(self._factories), 'name')}(...)"
         return f"write {example}, or several with + between them."
+
+
+def modules(text: str) -> set[str]:
+    """Return the modules that an expression names as ``module:Class``, which `Registry.make` would import.
+
+    Raises ValueError if the text cannot be read.
+
+    Example:
+        >>> modules("dropout(0.1) + mine.drops:Mine('no:Module')")
+        {'mine.drops'}
+    """
+    text = text.strip()
+    try:
+        names = [_name(term, text) for term in _terms(text)]
+    except (SyntaxError, RecursionError, MemoryError) as error:
+        raise ValueError(f"{text!r:.200} cannot be read: {error}.") from error
+    return {name.rpartition(".")[0] for name in names if "." in name}
+
+
+def _terms(text: str) -> list[ast.expr]:
+    """Return the calls and names that an expression joins by ``+``; raises what `ast.parse` raises."""
+    if not text:
+        return []
+    # Turn module:Class into module.Class, which Python can parse, outside string literals; {1:True} stays.
+    source = re.sub(r"""('[^']*'|"[^"]*")|([A-Za-z_][\w.]*):(?=[A-Za-z_])""", lambda x: x[1] or f"{x[2]}.", text)
+    node: ast.expr = ast.parse(source, mode="eval").body
+    terms: list[ast.expr] = []
+    while isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        terms.insert(0, node.right)
+        node = node.left
+    return [node, *terms]
+
+
+def _name(node: ast.expr, text: str) -> str:
+    """Return what a call or a name names, with ``.`` for ``:``; nothing if it is neither."""
+    name = _written(node.func if isinstance(node, ast.Call) else node, text)
+    return name.replace(":", ".") if re.fullmatch(r"[A-Za-z_][\w.:]*", name) else ""
 
 
 def _written(node: ast.expr, text: str) -> str:

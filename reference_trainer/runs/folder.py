@@ -42,7 +42,7 @@ SCENE = "scene"  # where `ca-reg run` puts photographs that have no cameras, in 
 MEMBERS = "members"  # where it puts runs that it distills into one
 
 _OWN_PAGE = b'<meta name="generator" content="ca-reg report">'  # near the beginning of report/page.html
-_CODE = ("regularizer", "loss", "density", "renderer", "format")  # settings that may name a module:Class
+_EXPRESSIONS = ("regularizer", "loss", "density", "renderer")  # settings that are read by a `Registry`
 
 
 def folder_name(text: str) -> str:
@@ -227,19 +227,25 @@ def modules_named(settings: Any) -> set[str]:
         >>> sorted(modules_named(TrainConfig(regularizer="dropout(0.1) + mine.drops:Mine(0.2)")))
         ['mine.drops']
     """
-    texts = [settings] if isinstance(settings, str) else [getattr(settings, name, "") for name in _CODE]
-    # The registries read module.Class like module:Class; what stands in quotes or is a number names nothing.
-    bare = [re.sub(r"'[^']*'|\"[^\"]*\"", "''", text) for text in texts if isinstance(text, str)]
-    return {found[1] for text in bare for found in re.finditer(r"([A-Za-z_][\w.]*)[.:][A-Za-z_]\w*", text)}
+    from ca_reg.registry import modules  # loads torch
+
+    if isinstance(settings, str):
+        return modules(settings)
+    reader, colon, _ = getattr(settings, "format", "").partition(":")
+    return set[str]([reader] * bool(colon)).union(*(modules(getattr(settings, name, "")) for name in _EXPRESSIONS))
 
 
 def check_trusted(where: Path, settings: Any, trust: Collection[str]) -> None:
     """Refuse settings read from a file that would import a module which nobody has named on the command line.
 
     Raises:
-        ValueError: with the module, and how to name it.
+        ValueError: with the module, and how to name it; also if an expression cannot be read.
     """
-    if unknown := sorted(modules_named(settings) - set(trust)):
+    try:
+        unknown = sorted(modules_named(settings) - set(trust))
+    except ValueError as error:
+        raise ValueError(f"{where} says what it was trained with: {error}") from error
+    if unknown:
         raise ValueError(
             f"{where} was trained with code of {', '.join(unknown)}, which is not imported because a file says so. If "
             f"it is yours, say --trust {' '.join(unknown)}."

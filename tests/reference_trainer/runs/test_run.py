@@ -318,7 +318,14 @@ def test_the_folder_of_the_scene_is_not_written_to(short, tmp_path):
         run_experiment(SceneOptions(str(tmp_path)), short, tmp_path)
 
 
-@pytest.mark.parametrize("place", ["config.json", "checkpoint", "loss", "scene"])
+HIDDEN = {  # all of these are module:Class to Python
+    "letters beyond ASCII": "evilmod.\u00c9(0.2)",
+    "comments": "(dropout(0.1) # '\n+ evilmod.Evil(0.2) # '\n)",
+    "escaped quotes": "dropout('\\'') + evilmod.Evil('\\'')",
+}
+
+
+@pytest.mark.parametrize("place", ["config.json", "checkpoint", "loss", "scene", *HIDDEN])
 def test_a_run_imports_no_code_that_nobody_has_named(place, finished, tmp_path, monkeypatch):
     """The module would leave a mark if it were imported."""
     out = tmp_path / "run"
@@ -327,7 +334,7 @@ def test_a_run_imports_no_code_that_nobody_has_named(place, finished, tmp_path, 
     (tmp_path / "evilmod.py").write_text(f"import pathlib; pathlib.Path({str(mark)!r}).touch()\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     claim = json.loads((out / CONFIG).read_text())
-    text = {"loss": "photometric + evilmod:Evil", "scene": "evilmod:evil"}.get(place, "evilmod:Evil(0.2)")
+    text = {"loss": "photometric + evilmod:Evil", "scene": "evilmod:evil", **HIDDEN}.get(place, "evilmod:Evil(0.2)")
     if place == "checkpoint":
         state = torch.load(out / CHECKPOINT, weights_only=True)
         state["config"] = json.dumps(json.loads(state["config"]) | {"regularizer": text})
