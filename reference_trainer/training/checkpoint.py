@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
 
 from reference_trainer.files import replacing
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians
@@ -19,7 +20,7 @@ from reference_trainer.tensor_files import load_tensors, moved
 from reference_trainer.training.assembly import make_density, make_regularizer
 from reference_trainer.training.config import TrainConfig, saved_config
 
-__all__ = ["TrainingState", "load_checkpoint", "read_state", "save_checkpoint"]
+__all__ = ["TrainingState", "fingerprints", "load_checkpoint", "read_state", "save_checkpoint"]
 
 _FORMAT = "ca_reg-checkpoint-1"
 
@@ -50,6 +51,18 @@ def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str,
     if not isinstance(state, dict) or state.get("format") != _FORMAT:
         raise ValueError(f"{path} is not a checkpoint of this program (expected format {_FORMAT!r}).")
     return state
+
+
+_SLACK = {"cameras": 1e-5, "photographs": 2e-3}  # beside 1e-4 of a number: decoders of JPEGs differ in the last bits
+
+
+def fingerprints(scene: Scene) -> dict[str, Tensor]:
+    """Return what tells the training views from others of their names: cameras (V, 18) and thumbnails (V, 192)."""
+    cameras = [view.camera for view in scene.train]
+    poses = torch.stack([camera.world_to_camera[:3].flatten() for camera in cameras])
+    lenses = poses.new_tensor([[c.fx, c.fy, c.cx, c.cy, c.width, c.height] for c in cameras])
+    thumbnails = torch.stack([adaptive_avg_pool2d(view.image, 8).flatten() for view in scene.train])
+    return {"cameras": torch.cat([poses, lenses], 1), "photographs": thumbnails.nan_to_num()}
 
 
 _TIMES = ("seconds", "processor_seconds")
@@ -91,13 +104,16 @@ def read_state(
 
 def _read(state: dict[str, Any], scene: Scene, where: Path, refuse: Callable[[TrainConfig], None]) -> TrainingState:
     """Read a state; wrong types that are not checked for raise TypeError, AttributeError or LookupError."""
-    others = ["others"] if "others" in state else []
-    _refuse_other_entries(state, (*_ENTRIES, *_OF_A_MODEL, *others), f"{where}")
+    # Checkpoints of one model have no others, older ones no fingerprints.
+    optional = [name for name in ("others", "fingerprints") if name in state]
+    _refuse_other_entries(state, (*_ENTRIES, *_OF_A_MODEL, *optional), f"{where}")
     names = [view.name for view in scene.train]
     if state["scene"] != scene.name:
         raise ValueError(f"{where} was trained on the scene {state['scene']!r:.80}, this one is {scene.name!r}.")
     if state["train_views"] != names:
         raise ValueError(f"{where} was trained on the views {state['train_views']!r:.400}, the scene has {names}.")
+    if "fingerprints" in state:
+        _refuse_other_views(state["fingerprints"], scene, where)
     config = _config(state["config"], where)
     refuse(config)
     step, times = state["step"], (state["seconds"], state["processor_seconds"])
@@ -105,7 +121,7 @@ def _read(state: dict[str, Any], scene: Scene, where: Path, refuse: Callable[[Tr
         raise ValueError(f"{where}: step must be a whole number from 0 to {config.iterations}, got {step!r:.80}.")
     if not all(type(x) is float and 0 <= x < math.inf for x in times):
         raise ValueError(f"{where}: {' and '.join(_TIMES)} must be positive numbers, got {times!r:.80}.")
-    models = [{name: state[name] for name in _OF_A_MODEL}, *(state["others"] if others else ())]
+    models = [{name: state[name] for name in _OF_A_MODEL}, *state.get("others", ())]
     if len(models) != config.models:
         raise ValueError(f"{where}: expected {config.models} models, got {len(models)}; the checkpoint is damaged.")
     read = [
@@ -113,6 +129,20 @@ def _read(state: dict[str, Any], scene: Scene, where: Path, refuse: Callable[[Tr
         for number, model in enumerate(models)
     ]
     return TrainingState(config, step, *times, read)
+
+
+def _refuse_other_views(found: Any, scene: Scene, where: Path) -> None:
+    """Refuse cameras or photographs that have changed under their names."""
+    expected = fingerprints(scene)
+    _refuse_other_entries(found, expected, f"{where}, fingerprints")
+    for what, x in expected.items():
+        _check(found[what], tuple(x.shape), f"{where}, fingerprints of {what}")
+        same = torch.isclose(found[what].to(x), x, rtol=1e-4, atol=_SLACK[what]).all(1).tolist()
+        if changed := [view.name for view, unchanged in zip(scene.train, same, strict=True) if not unchanged]:
+            raise ValueError(
+                f"{where} was trained with other {what} of the same names, see {changed}: put those back, or train in "
+                "another folder. The PLY can be measured on a changed scene: ca-reg evaluate PLY --scene FOLDER."
+            )
 
 
 def _read_model(

@@ -29,7 +29,7 @@ from reference_trainer.training.assembly import (
     make_regularizer,
     make_renderer,
 )
-from reference_trainer.training.checkpoint import load_checkpoint, read_state, save_checkpoint
+from reference_trainer.training.checkpoint import fingerprints, load_checkpoint, read_state, save_checkpoint
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.interruption import TrainingStoppedError, hold_interrupts
 from reference_trainer.training.model_state import ModelState
@@ -230,6 +230,7 @@ class Trainer:
             "config": json.dumps(dataclasses.asdict(self.config)),
             "scene": self.scene.name,
             "train_views": [view.name for view in self.scene.train],
+            "fingerprints": fingerprints(self.scene),
             "step": self.step,
             "seconds": self.seconds,
             "processor_seconds": self.processor_seconds,
@@ -258,7 +259,7 @@ class Trainer:
         Raises:
             FileNotFoundError: if there is no such file.
             ValueError: if the file is not a readable checkpoint, something in it is missing or does not fit, or it
-                belongs to another scene or other training views.
+                belongs to another scene or other training views, be it of the same names.
         """
         state = read_state(load_checkpoint(path, device), scene, path, refuse)
         try:

@@ -6,6 +6,7 @@ import math
 import os
 import pickle
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +148,7 @@ def test_a_missing_entry(saved, tiny_scene, tmp_path, key):
         (lambda s: s.update(step=True), "step must be a whole number"),
         (lambda s: s.update(step=6), "step must be a whole number from 0 to 5, got 6"),
         (lambda s: s.update(seconds=math.nan), "seconds and processor_seconds must be positive numbers, got .nan"),
+        (lambda s: s["fingerprints"].update(cameras=3), "fingerprints of cameras: expected float32"),
         (lambda s: s.update(config="{"), "damaged checkpoint: config is not JSON: Expecting"),
         (lambda s: s.update(config=3), "damaged checkpoint: "),
         (lambda s: s.update(config=json.dumps({"dropuot": 0.2})), r"unknown settings \['dropuot'\]"),
@@ -167,6 +169,23 @@ def test_a_missing_entry(saved, tiny_scene, tmp_path, key):
 )
 def test_an_entry_that_does_not_fit(saved, tiny_scene, tmp_path, change, said):
     refused(saved, tiny_scene, tmp_path, change, said)
+
+
+def test_views_that_changed_under_their_names_are_not_trained_on(saved, tiny_scene, tmp_path):
+    first, *others = tiny_scene.train
+    moved = replace(first.camera, world_to_camera=first.camera.world_to_camera + 1e-3 * torch.eye(4, 4).roll(-1, 1))
+    patched = first.image.clone()
+    patched[:, :6, :6] = 1 - patched[:, :6, :6]
+    for what, changed in (("cameras", replace(first, camera=moved)), ("photographs", replace(first, image=patched))):
+        scene = replace(tiny_scene, train=(changed, *others))
+        refused(saved, scene, tmp_path, lambda state: None, rf"other {what} of .*{first.name}'\]")
+    # Another decoder rounds differently, and an older version kept no fingerprints.
+    rounded = replace(first, image=first.image + 1e-3 * torch.rand_like(first.image))
+    assert Trainer.load(saved, replace(tiny_scene, train=(rounded, *others))).step == 2
+    state = load_checkpoint(saved)
+    del state["fingerprints"]
+    save_checkpoint(tmp_path / "old.pt", state)
+    assert Trainer.load(tmp_path / "old.pt", replace(tiny_scene, train=(changed, *others))).step == 2
 
 
 @pytest.mark.parametrize("name", ["means", "sh_rest"])
