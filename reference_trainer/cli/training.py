@@ -261,7 +261,7 @@ class Compare:
     """What to compare: these, "analytic-dropout", "analytic-noise", whose rates --dropout and --noise give (0.2 and 0.8
     if they are 0), or regularizers as of --regularizer, such as "d2gs"."""
     seeds: int = 3
-    """Number of seeds."""
+    """Number of seeds, the first being --seed."""
     jobs: int = 1
     """Runs at a time, each in its own process with its share of the processors (of the whole cluster, on Ray)."""
     executor: ExecutorName = "auto"
@@ -315,7 +315,8 @@ class Compare:
         )
         if self.config.renderer == "builtin":
             self.rendering.begin(self.device, trains=True)
-        comparisons = compare(scene_folders(self._paths, self.scene, self.out), chosen, range(self.seeds), running)
+        scenes, seeds = scene_folders(self._paths, self.scene, self.out), range(self.seeds)
+        comparisons = compare(scenes, chosen, [self.config.seed + number for number in seeds], running)
         report(comparisons)
         trust = set[str]().union(*map(modules_named, (self.scene, *chosen.values())))  # named on this command line
         # The pages are written here, where the machines of a cluster may have cards and this one none.

@@ -23,7 +23,7 @@ def test_a_cluster_may_have_the_card(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("given", "rates"),
     [([], {"baseline": (0.0, 0.0), "dropout": (0.2, 0.0), "noise": (0.0, 0.8), "both": (0.2, 0.8)}),
-     (["--strategies", "baseline", "both", "--dropout", "0.3", "--noise", "0.1"],
+     (["--strategies", "baseline", "both", "--dropout", "0.3", "--noise", "0.1", "--seed", "5"],
       {"baseline": (0.0, 0.0), "both": (0.3, 0.1)})],
 )  # fmt: skip
 def test_what_is_compared(given, rates, monkeypatch, tmp_path):
@@ -37,7 +37,7 @@ def test_what_is_compared(given, rates, monkeypatch, tmp_path):
     main(["compare", "--out", str(tmp_path), "--seeds", "2", "--jobs", "3", "--iterations", "7", *given])
     assert {name: (config.dropout, config.noise) for name, config in asked["configs"].items()} == rates
     assert {config.iterations for config in asked["configs"].values()} == {7}
-    assert (asked["seeds"], asked["running"].executor.jobs) == ([0, 1], 3)
+    assert (asked["seeds"], asked["running"].executor.jobs) == ([5, 6] if given else [0, 1], 3)
     assert asked["scenes"] == {tmp_path: SceneOptions()}
 
 
