@@ -177,7 +177,8 @@ def run_experiment(
         remove_leftovers(out, below=False)  # an evaluation of the run may be writing to a subfolder right now
         remove_leftovers(out / VIEWS)
         resumed = (out / CHECKPOINT).exists()
-        trainer = _load(out, scene, device, modules_named(config)) if resumed else Trainer(scene, settings, device)
+        own = modules_named(config)
+        trainer = _load(out, scene, device, settings, own) if resumed else Trainer(scene, settings, device)
         write_json(out / CONFIG, run_settings(options, settings))
         if resumed:
             _log.info("%s: continues from step %d", out, trainer.step)
@@ -207,12 +208,28 @@ def load_run(folder: Path, device: torch.device | str = "cpu", *, trust: Collect
             f"{folder} was trained on {options.path}, which is not there anymore: put the scene back, or write where "
             f'it is now, under the same name, as "path" into {folder / CONFIG}.'
         )
-    return _load(folder, load_scene(options, seed=config.seed), device, trust)
+    return _load(folder, load_scene(options, seed=config.seed), device, config, trust)
 
 
-def _load(folder: Path, scene: Scene, device: torch.device | str, trust: Collection[str]) -> Trainer:
-    """Load the checkpoint of a run, whose settings may name no module but those in ``trust``."""
-    return Trainer.load(folder / CHECKPOINT, scene, device, refuse=lambda config: check_trusted(folder, config, trust))
+def _load(
+    folder: Path, scene: Scene, device: torch.device | str, config: TrainConfig, trust: Collection[str]
+) -> Trainer:
+    """Load the checkpoint of a run, whose settings are those of its ``config.json`` and name no untrusted module."""
+
+    def refuse(found: TrainConfig) -> None:
+        check_trusted(folder, found, trust)
+        # A trainer that starts from a model sets sh_every, and a run that has moved finds the models of its loss there.
+        changed = [
+            f"{name}: {value} -> {getattr(config, name)}"
+            for name, value in vars(found).items()
+            if value != getattr(config, name) and name not in ("sh_every", "loss")
+        ]
+        if changed:
+            raise ValueError(
+                f"{folder / CONFIG} was changed since the training began ({'; '.join(changed)}): undo that."
+            )
+
+    return Trainer.load(folder / CHECKPOINT, scene, device, refuse=refuse)
 
 
 def _complete(out: Path, perceptual: LPIPS | None) -> dict[str, Any]:

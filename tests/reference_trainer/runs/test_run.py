@@ -347,6 +347,8 @@ def test_a_run_imports_no_code_that_nobody_has_named(place, finished, tmp_path, 
         load_run(out)
     assert not mark.exists()
     if place == "checkpoint":
+        claim["config"]["regularizer"] = text
+        (out / CONFIG).write_text(json.dumps(claim))
         with pytest.raises(ValueError, match="evilmod:Evil cannot be had"):  # there is no such class, but:
             load_run(out, trust=["evilmod"])
         assert mark.exists()
@@ -359,6 +361,19 @@ def test_another_run_in_the_same_folder_is_refused(finished, options, short):
     with pytest.raises(ValueError, match=r"\(views: None -> 2; seed: 0 -> 3\)"):
         run_experiment(dataclasses.replace(options, views=2), dataclasses.replace(short, seed=3), out)
     assert json.loads((out / RESULTS).read_text()) == results
+
+
+def test_settings_that_were_changed_in_the_file_are_not_taken_for_those_of_the_training(
+    finished, options, short, tmp_path
+):
+    """The training would go on with its own, and a report would show the others."""
+    shutil.copytree(finished[0], tmp_path / "run")
+    (tmp_path / "run" / RESULTS).unlink()
+    file = tmp_path / "run" / CONFIG
+    file.write_text(file.read_text().replace('"dropout": 0.2', '"dropout": 0.5'))
+    for use in (load_run, lambda out: run_experiment(options, dataclasses.replace(short, dropout=0.5), out)):
+        with pytest.raises(ValueError, match=r"config\.json .*dropout: 0\.2 -> 0\.5"):
+            use(tmp_path / "run")
 
 
 def test_a_run_of_a_version_without_a_setting_was_at_its_default(finished, options, short, tmp_path):
