@@ -5,6 +5,7 @@ Imports no torch: the command line checks folders with it before it loads anythi
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import errno
 import os
@@ -90,7 +91,10 @@ def read_run_settings(path: str | Path) -> tuple[SceneOptions, TrainConfig]:
     if scene.init and Path(scene.init).parts[-3:-2] == (MEMBERS,) and (here / MEMBERS).is_dir():
         before, now = (folder.as_posix() for folder in (Path(scene.init).parents[2], here.resolve()))
         scene = dataclasses.replace(scene, init=scene.init.replace(before, now))
-        config = dataclasses.replace(config, loss=config.loss.replace(before, now))
+        # Quoted anew: a name with one quotation mark needs the other around it.
+        quoted = r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\""""
+        moved = re.sub(quoted, lambda at: repr(ast.literal_eval(at[0]).replace(before, now)), config.loss)
+        config = dataclasses.replace(config, loss=moved)
     return scene, config
 
 
