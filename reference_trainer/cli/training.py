@@ -244,8 +244,8 @@ class Compare:
     """Train baseline, dropout, noise and both, with several seeds.
 
     One table per scene with mean and spread. Finished runs are kept: the same command continues an interrupted
-    comparison, or adds seeds. A run that fails is reported at the end and does not stop the others; the exit code is
-    then 1.
+    comparison, or adds strategies or seeds. A run that fails is reported at the end and does not stop the others; the
+    exit code is then 1.
     """
 
     out: Path

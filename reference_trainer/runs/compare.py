@@ -6,6 +6,7 @@ import dataclasses
 import logging
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -22,6 +23,8 @@ from reference_trainer.runs.folder import (
     RESULTS,
     check_output,
     folder_name,
+    read_results,
+    read_run_settings,
     report_file,
     settings_of_run,
 )
@@ -69,8 +72,7 @@ def strategies(
             "--strategies says what is compared: name regularizers there, and analytic-dropout or analytic-noise."
         )
     rates = {"dropout": dropout, "noise": noise}
-    plain = dataclasses.replace(config, dropout=0.0, noise=0.0, regularizer="", analytic=False)
-    made = {}
+    plain, made = _plain(config), {}
     for name in names:
         if name in NAMED:
             p, sigma = (rates[rate] if rate in NAMED[name] else 0.0 for rate in ("dropout", "noise"))
@@ -80,6 +82,11 @@ def strategies(
     for settings in made.values():
         check(settings)
     return made
+
+
+def _plain(config: TrainConfig) -> TrainConfig:
+    """Return the settings without what a strategy changes."""
+    return dataclasses.replace(config, dropout=0.0, noise=0.0, regularizer="", analytic=False)
 
 
 def scene_folders(paths: Sequence[str], options: SceneOptions, out: Path) -> dict[Path, SceneOptions]:
@@ -110,7 +117,8 @@ def compare(
     """Train every strategy on every scene with every seed; finished runs are kept, interrupted ones continue.
 
     The run with seed k is in ``<folder>/<strategy>/seed_<k>``; seeds replace that of the settings. Returns, for every
-    folder, the results of the finished runs and the failures of the others; both are also written there.
+    folder, the results of the finished runs, those of other strategies among them that were trained there before on the
+    same scene with the same settings, and the failures of the others; both are also written there.
 
     Raises:
         ValueError: if there is nothing to run, a scene lacks what a term of the loss needs, a folder holds a table, a
@@ -141,7 +149,7 @@ def compare(
             scene = load_scene(options)
             for term in looking:
                 term.begin(scene)
-    comparisons = {folder: Comparison({}, {}) for folder in scenes}
+    comparisons = {folder: Comparison(_others(folder, scenes[folder], configs), {}) for folder in scenes}
     for (folder, name, seed), outcome in zip(runs, run_grid([*runs.values()], running), strict=True):
         if isinstance(outcome, Failure):
             comparisons[folder].failures[_label(name, seed)] = outcome
@@ -150,6 +158,19 @@ def compare(
     for folder, comparison in comparisons.items():
         save(comparison, folder)
     return comparisons
+
+
+def _others(folder: Path, options: SceneOptions, configs: Mapping[str, TrainConfig]) -> dict[str, list[dict[str, Any]]]:
+    """Return the results of strategies trained in the folder before, on the same scene and otherwise alike."""
+    alike = {dataclasses.replace(_plain(config), seed=0) for config in configs.values()}
+    found: dict[str, list[dict[str, Any]]] = {}
+    for run in sorted(path.parent for path in folder.glob(f"*/seed_*/{RESULTS}")):
+        with suppress(ValueError, OSError):  # of a damaged one: the new runs are worth a table all the same
+            scene, config = read_run_settings(run / CONFIG)
+            same = scene == options.absolute() and dataclasses.replace(_plain(config), seed=0) in alike
+            if same and run.parent.name not in configs:
+                found.setdefault(run.parent.name, []).append(read_results(run))
+    return found
 
 
 def _label(name: str, seed: int) -> str:

@@ -199,6 +199,24 @@ def test_other_settings_leave_a_finished_comparison_as_it_is(tmp_path):
     assert (tmp_path / COMPARISON).read_text() == "the results"
 
 
+def test_strategies_that_are_compared_later_stand_beside_those_of_before(tmp_path, monkeypatch):
+    """But for those that were trained for another time, or on other views."""
+    results = {**made(20.0), "config": {"seed": 3}, "views": [{"name": "a", "split": "train"}]}
+    results["mean"]["train"] = {}
+    short, others = TrainConfig(iterations=7), (SceneOptions(), SceneOptions(views=2))
+    for name, options, config in (
+        ("before", others[0], dataclasses.replace(short, noise=0.3, seed=3)),
+        ("longer", others[0], TrainConfig(iterations=8)),
+        ("narrower", others[1], short),
+    ):
+        write_json(tmp_path / name / "seed_3/config.json", run_settings(options, config))
+        write_json(tmp_path / name / "seed_3" / RESULTS, results)
+    monkeypatch.setattr("reference_trainer.runs.grid.train_run", lambda *_: made(21.0))
+    compare({tmp_path: SceneOptions()}, {"new": short}, [0], Running(Here()))
+    assert [row["strategy"] for row in cells((tmp_path / TABLE).read_text())] == ["before", "new"]
+    assert list(json.loads((tmp_path / COMPARISON).read_text())["runs"]) == ["before", "new"]
+
+
 def test_failed_runs_are_listed_at_the_end(tmp_path, said):
     report({tmp_path: Comparison({}, {"a, seed 0": Failure("ValueError: no", "Traceback")})})
     assert said[-2].startswith("1 of 1 runs FAILED")
