@@ -55,7 +55,8 @@ class Alpha(WeightedTerm):
         # Computed once per photograph: it does not change, and pooling 49 rows is not free.
         name = step.view.name
         if name not in self._backgrounds:
-            self._backgrounds[name] = self._background(step.view)
+            photograph = step.view.over(step.photographed_over, step.background)  # that is another at each step
+            self._backgrounds[name] = self._background(photograph)
         return (step.rendering.alpha * self._backgrounds[name]).mean()
 
     def _background(self, view: View) -> Tensor:

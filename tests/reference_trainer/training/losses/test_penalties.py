@@ -44,6 +44,18 @@ def test_a_dark_background_counts_instead_of_alpha(take_step):
     assert Alpha(1.0, dark=0.1)(step).item() == pytest.approx(expected, rel=1e-12)
 
 
+def test_a_dark_background_is_dark_over_every_color_of_a_step(take_step):
+    """With random_background what is transparent was as bright as the color of the first step."""
+    step = take_step()
+    alpha = (torch.arange(25) < 12).double().expand(17, 25)
+    step.view = dataclasses.replace(step.view, image=step.view.image * alpha, alpha=alpha)
+    expected = Alpha(1.0, dark=0.1)(step)
+    assert expected > 0
+    black, step.background = step.background, torch.full_like(step.background, 0.7)
+    step.view = step.view.over(step.background, black)
+    assert torch.equal(Alpha(1.0, dark=0.1)(step), expected)
+
+
 def test_gradients_of_alpha(assert_gradients_of_differences):
     assert_gradients_of_differences(Alpha(0.7), "means", "opacity_logits", "log_scales")
 
