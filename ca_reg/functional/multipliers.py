@@ -133,7 +133,8 @@ class Multiplier:
         # A clipped draw may leave a survivor's opacity always at 1: the two cuts then coincide.
         lowest = (-highest).clamp(min=min(1.0 / sigma, cut))
         (up, up_square), (down, down_square) = _upper_half(highest), _upper_half(lowest)
-        shift, over = up - down, raised.clamp(min=1.0)
+        # Not clamp, whose gradient at 1 is in torch 2.13 that from above, of survivors, and another in torch 2.15.
+        shift, over = up - down, torch.where(raised > 1.0, raised, 1.0)
         variance = (sigma * over).square() * (up_square + down_square - shift.square()).clamp(min=0.0)
         return cls((over * (1.0 + sigma * shift)).to(opacity.dtype), variance.to(opacity.dtype))
 

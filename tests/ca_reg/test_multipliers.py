@@ -125,6 +125,15 @@ def test_clamped_noise_is_differentiable(gain, clip):
     assert torch.autograd.gradcheck(moments, (opacity,))
 
 
+@pytest.mark.parametrize("clip", [False, True])
+def test_the_gradient_at_an_opacity_of_one_is_that_from_below(clip):
+    opacity = torch.tensor([1.0, 1 - 1e-9], dtype=torch.float64, requires_grad=True)
+    noise = Multiplier.clamped_noise(opacity, 0.8, clip=clip)
+    for moment in (noise.mean, noise.variance):
+        (gradient,) = torch.autograd.grad(moment.sum(), opacity, retain_graph=True)
+        torch.testing.assert_close(gradient[0], gradient[1], rtol=1e-6, atol=0)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("sigma", [1e-6, 0.8, 10.0])
 def test_gradients_stay_finite_at_the_ends_of_the_range(sigma, dtype):
