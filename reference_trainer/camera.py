@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass, replace
 
 import torch
@@ -21,6 +22,7 @@ class Camera:
     Raises:
         ValueError: if the view matrix is not a finite (4, 4) tensor, a focal length is not positive and finite, the
             principal point not finite, or the size not positive.
+        TypeError: if a length or the principal point is no number, or the size not whole numbers.
 
     Example:
         >>> camera = Camera(torch.eye(4), fx=100.0, fy=100.0, cx=32.0, cy=24.0, width=64, height=48)
@@ -37,6 +39,9 @@ class Camera:
     height: int  # image height, pixels
 
     def __post_init__(self) -> None:
+        # Numbers of Python whatever was given, such as numpy's, which Triton does not take.
+        vars(self).update({name: float(getattr(self, name)) for name in ("fx", "fy", "cx", "cy")})
+        vars(self).update({name: operator.index(getattr(self, name)) for name in ("width", "height")})
         pose = self.world_to_camera
         if pose.shape != (4, 4) or not bool(torch.isfinite(pose).all()):
             raise ValueError(f"world_to_camera must be a finite (4, 4) tensor, got shape {tuple(pose.shape)}: {pose}.")

@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -66,6 +67,15 @@ def test_to_changes_the_pose_alone():
     moved = camera().to(dtype=torch.float64)
     assert moved.world_to_camera.dtype == torch.float64
     assert (moved.fx, moved.width) == (60.0, 64)
+
+
+@pytest.mark.parametrize("kind", [int, np.float32, torch.tensor])
+def test_numbers_of_any_kind_become_those_of_python(kind):
+    found = camera(fx=kind(60), cy=kind(23), width=np.int64(64))
+    assert [type(x) for x in (found.fx, found.cy, found.width)] == [float, float, int]
+    assert (found.fx, found.cy, found.width) == (60, 23, 64)
+    with pytest.raises(TypeError):
+        camera(height=48.5)
 
 
 @pytest.mark.parametrize(
