@@ -22,7 +22,7 @@ from reference_trainer.compat.planes import filtered
 from reference_trainer.model.gaussians import compute_relocation
 from reference_trainer.render import Splats, rasterize, splat
 from reference_trainer.render.constants import DILATION, MIN_ALPHA, NEAR_PLANE
-from reference_trainer.render.densification import absgrad_sink, longer_radii, with_absolute_gradients
+from reference_trainer.render.densification import MAX_RADIUS, absgrad_sink, longer_radii, with_absolute_gradients
 from reference_trainer.rotations import rotation_matrices
 
 __all__ = ["gsplat_functions", "make_rasterization", "quat_scale_to_covar_preci"]
@@ -198,7 +198,7 @@ def _extents(splats: Splats, per_axis: bool) -> Tensor:
     if per_axis:
         xx, _, yy = splats.projection.covariances.unbind(-1)
         extent = (2 * (splats.opacities / MIN_ALPHA).clamp_min(1).log()).sqrt().clamp_max(EXTENT)
-        return (extent[:, None] * torch.stack([xx, yy], dim=1).sqrt()).ceil()
+        return (extent[:, None] * torch.stack([xx, yy], dim=1).sqrt()).ceil().clamp_max(MAX_RADIUS)
     return longer_radii(splats.projection.covariances, SMALLEST_SPREAD)[:, None].expand(-1, 2)
 
 

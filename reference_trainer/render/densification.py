@@ -16,11 +16,12 @@ from reference_trainer.render.splats import Rendering, Splats
 from reference_trainer.render.torch.projection import project
 
 __all__ = [
-    "SMALLEST_SPREAD", "absgrad_sink", "in_front", "longer_radii", "splat_weights", "visible_radii",
+    "MAX_RADIUS", "SMALLEST_SPREAD", "absgrad_sink", "in_front", "longer_radii", "splat_weights", "visible_radii",
     "with_absolute_gradients",
 ]  # fmt: skip
 
 SMALLEST_SPREAD = 0.1**0.5  # px^2, of the INRIA code
+MAX_RADIUS = 2.0**31 - 128  # pixels, the largest float32 that is an int32: CUDA's conversion ends there as well
 # Pixels; a Gaussian is visible to the INRIA code if the square around it meets a tile of the image.
 CUDA_TILE = 16
 
@@ -34,7 +35,7 @@ def in_front(means: Tensor, camera: Camera) -> Tensor:
 
 @torch.no_grad()
 def longer_radii(covariances: Tensor, smallest: float) -> Tensor:
-    """Return three standard deviations of the longer axis of 2D covariances (M, 3), rounded up.
+    """Return three standard deviations of the longer axis of 2D covariances (M, 3), rounded up, at most `MAX_RADIUS`.
 
     More for round splats: half the difference of the axes' variances counts as at least
     ``smallest``.
@@ -45,7 +46,7 @@ def longer_radii(covariances: Tensor, smallest: float) -> Tensor:
     """
     xx, xy, yy = covariances.unbind(-1)
     spread = torch.hypot(0.5 * (xx - yy), xy).clamp_min(smallest)
-    return torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt())
+    return torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt()).clamp_max(MAX_RADIUS)
 
 
 @torch.no_grad()

@@ -178,6 +178,13 @@ def test_radii_of_either_version():
     assert torch.equal(older(**a)[2]["radii"], radius[radius > 0])
 
 
+@pytest.mark.parametrize("per_axis", [True, False])
+def test_the_radius_of_a_diverged_gaussian_is_no_negative_number(per_axis):
+    a = given(n=3, means=torch.zeros(3, 3).double(), scales=torch.full((3, 3), 1e10).double())
+    radii = make_rasterization(rendering.rasterization, per_axis=per_axis)(**a)[2]["radii"]
+    assert radii.min() == radii.max() == 2**31 - 128
+
+
 def test_small_and_faint_gaussians_are_left_out():
     a = given()
     clip = 4

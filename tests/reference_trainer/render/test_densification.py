@@ -57,6 +57,13 @@ def test_half_precision_has_the_radii_of_its_numbers(dtype):
     assert torch.equal(visible_radii(means.float(), quaternions, scales, scene.camera), expected)
 
 
+def test_the_radius_of_a_diverged_gaussian_is_no_negative_number():
+    scene = random_scene(30, 20, 20, seed=3)
+    means = torch.zeros_like(scene.means)
+    radii = visible_radii(means, scene.quaternions, 1e10 * torch.ones_like(means), scene.camera)
+    assert radii.tolist() == [2**31 - 128] * 30
+
+
 def test_in_front_is_the_near_plane():
     scene = random_scene(60, 20, 20, seed=3)
     depths = [(scene.camera.world_to_camera[:3, :3] @ x + scene.camera.world_to_camera[:3, 3])[2] for x in scene.means]
