@@ -168,8 +168,8 @@ def render_moments(splats: Splats, multiplier: Multiplier, *, background: Tensor
 
     Args:
         splats: of the full model, with its plain opacities.
-        multiplier: moments of the factor, numbers for all Gaussians, or tensors of shape (N,), one
-            value each.
+        multiplier: moments of the factor, numbers for all Gaussians, or tensors of shape (N,) or (N, 1),
+            one value each.
         background: fixed color behind everything, shape (3,), or one for each pixel, (3, H, W);
             black by default.
 
@@ -240,5 +240,5 @@ def _factors(multiplier: Multiplier, splats: Splats) -> Tensor:
     """Return mean and variance of every projected Gaussian's factor, (M, 2)."""
     found = splats.opacities.new_empty(len(splats.opacities), 2)
     for i, x in enumerate((multiplier.mean, multiplier.variance)):
-        found[:, i] = x[splats.indices] if isinstance(x, Tensor) else x
+        found[:, i] = x.flatten()[splats.indices] if isinstance(x, Tensor) else x
     return found

@@ -64,6 +64,14 @@ def test_moments_equal_the_closed_form_per_pixel(name, per_pixel, case):
     assert (ours.variance >= 0).all()
 
 
+def test_a_multiplier_may_have_the_shape_of_opacities_in_a_column(case):
+    s = random_scene(30, 19, 13, seed=7).to(case.dtype)
+    splats = splat(*s[:3], s.opacities[:, None], s.camera, colors=s.colors)
+    row = Multiplier.clamped_noise(s.opacities, 0.8)
+    column = Multiplier.clamped_noise(s.opacities[:, None], 0.8)
+    assert torch.equal(render_moments(splats, column).variance, render_moments(splats, row).variance)
+
+
 @pytest.mark.parametrize("behind", [BACKGROUND, backdrop(13, 19)], ids=["one color", "per pixel"])
 def test_gradients_equal_autograd_through_the_closed_form(behind, case):
     scene = random_scene(40, 19, 13, seed=7)
