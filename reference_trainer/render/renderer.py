@@ -24,12 +24,13 @@ def splat(
     sh: Tensor | None = None,
     sh_degree: int | None = None,
     colors: Tensor | None = None,
+    background: Tensor | None = None,
 ) -> Splats:
     """Project Gaussians, evaluate their colors and list them per tile.
 
     Gaussians that cannot be seen (behind the near plane, or with an opacity below `MIN_ALPHA`, such
     as dropped ones) are left out before the projection and cost nothing. The arguments are those of
-    `render`.
+    `render`; a background is only looked at here, where that takes no further wait for a card.
 
     Raises:
         TypeError: if a tensor is not floating point.
@@ -39,14 +40,6 @@ def splat(
             the camera, or dropped, only position and opacity must be finite.
         NotImplementedError: if the camera's pose requires a gradient, which the engine torch alone computes.
     """
-    return _splat(means, quaternions, scales, opacities, camera, sh, sh_degree, colors, None)
-
-
-def _splat(
-    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, camera: Camera,
-    sh: Tensor | None, sh_degree: int | None, colors: Tensor | None, background: Tensor | None,
-) -> Splats:  # fmt: skip
-    """Do what `splat` does; a background is looked at with its numbers, without a further wait for a card."""
     values, degree = checked_colors(sh, sh_degree, colors)
     n = means.shape[0]
     if opacities.shape not in ((n,), (n, 1)):
@@ -123,7 +116,9 @@ def render(
         >>> out.image.shape, round(out.alpha.max().item(), 1)
         (torch.Size([3, 32, 32]), 0.8)
     """
-    splats = _splat(means, quaternions, scales, opacities, camera, sh, sh_degree, colors, background)
+    splats = splat(
+        means, quaternions, scales, opacities, camera, sh=sh, sh_degree=sh_degree, colors=colors, background=background
+    )
     return rasterize(splats, background=background, depth=depth)
 
 
