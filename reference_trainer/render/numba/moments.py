@@ -1,23 +1,12 @@
-"""The recursion of the exact moments, tile by tile, its gradient, and the shares.
+"""The recursion of the exact moments (`ca_reg.functional.pixel_moments`), tile by tile, its gradient, and the shares.
 
-The recursion is that of `ca_reg.functional.pixel_moments`.
+Back to front, with ``d_i = c_i - mu_{i+1}`` the contrast of a splat with the mean of what is behind it:
 
-Every alpha is multiplied by an independent random factor of mean m and variance v. With X the color
-of what is behind a splat, of mean mu and variance V, the splat makes of it
+    mu_i = mu_{i+1} + m alpha_i d_i      V = sum_i spread_i S_i d_i^2      S_i = prod_{j<i} shrink_j
 
-    f alpha c + (1 - f alpha) X.
-
-Mean and variance of that, by the law of total variance, with the contrast ``d = c - mu``:
-
-    mu -> mu + m alpha d
-    V  -> ((1 - m alpha)^2 + v alpha^2) V + v alpha^2 d^2  =  shrink V + spread d^2
-
-Applied back to front to all splats, nearest first i = 0, 1, ..., this is
-
-    mu_i = mu_{i+1} + m alpha_i d_i     V = sum_i spread_i S_i d_i^2     S_i = prod_{j<i} shrink_j
-
-Every term of V is a square times a non-negative weight: nothing cancels. The terms are the shares
-of the splats. The expected transmittance is 1 minus the expected accumulated alpha.
+where ``spread = v alpha^2`` and ``shrink = (1 - m alpha)^2 + spread``. Every term of V is a square times a non-negative
+weight: nothing cancels. The terms are the shares of the splats. The expected transmittance is 1 minus the expected
+accumulated alpha.
 """
 
 from __future__ import annotations

@@ -25,13 +25,16 @@ from reference_trainer.render.torch.projection import visible
 
 __all__ = ["basis", "basis_gradient", "project"]
 
+Array = Any
 f4 = np.float32
 _A = f4(math.sqrt(1 / (4 * math.pi)))
 _B = f4(math.sqrt(3 / (4 * math.pi)))
 _C, _D = f4(math.sqrt(15 / (4 * math.pi))), f4(math.sqrt(5 / (16 * math.pi)))
 _E, _F = f4(math.sqrt(35 / (32 * math.pi))), f4(math.sqrt(105 / (4 * math.pi)))
 _G, _H = f4(math.sqrt(21 / (32 * math.pi))), f4(math.sqrt(7 / (16 * math.pi)))
-_HALF, _TWO, _THREE, _FOUR, _SIX, _EIGHT = f4(0.5), f4(2), f4(3), f4(4), f4(6), f4(8)
+_ZERO, _HALF, _ONE, _TWO, _THREE = f4(0), f4(0.5), f4(1), f4(2), f4(3)
+_FOUR, _SIX, _EIGHT, _DILATION = f4(4), f4(6), f4(8), f4(DILATION)
+_NO_DIRECTION = f4(1e-30)  # a quaternion well below this is taken for 0
 
 
 @inlined
@@ -74,12 +77,6 @@ def basis_gradient(x: Any, y: Any, z: Any, degree: Any, to_values: Any) -> Any:
             to_z += _F * (x * y * g[10] + _HALF * (xx - yy) * g[14]) - _EIGHT * _G * z * (y * g[11] + x * g[13])
             to_z += _THREE * _H * (_TWO * zz - xx - yy) * g[12]
     return to_x, to_y, to_z
-
-
-Array = Any
-_ZERO, _ONE, _TWO, _HALF = f4(0), f4(1), f4(2), f4(0.5)
-_DILATION = f4(DILATION)
-_NO_DIRECTION = f4(1e-30)  # a quaternion well below this is taken for 0
 
 
 @inlined
