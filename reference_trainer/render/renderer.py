@@ -84,7 +84,7 @@ def render(
     background: Tensor | None = None,
     depth: bool = False,
 ) -> Rendering:
-    """Render 3D Gaussians; differentiable in every tensor.
+    """Render 3D Gaussians; differentiable in every tensor, once: second derivatives lack what the pixels add.
 
     Convention: OpenCV camera, half-pixel centers, wxyz quaternions; the constants of the INRIA
     rasterizer. The work is done in float64 if the means are, else in float32: also for float16 and
@@ -158,7 +158,7 @@ def render_masks(splats: Splats, opacities: Tensor, *, background: Tensor | None
 def render_moments(splats: Splats, multiplier: Multiplier, *, background: Tensor | None = None) -> MomentImages:
     """Render exact mean and variance of a view under random factors on the alphas.
 
-    Differentiable. The factors are independent per splat. There is no early stop: splats behind an
+    Differentiable once. The factors are independent per splat. There is no early stop: splats behind an
     opaque surface shine through its dropped ones.
 
     Args:
