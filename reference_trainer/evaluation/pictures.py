@@ -37,8 +37,8 @@ _TEXT, _LINE, _BAR = 15, 20, 8  # pixels: size of letters, height of a line of t
 _UNDEFINED = "0.5"  # gray for values that are not finite; not a color of the map
 
 
-def file_names(views: Sequence[str]) -> list[str]:
-    """Return a unique file name without extension for each view's pictures; none is that of another view's panel.
+def file_names(views: Sequence[str], ends: Sequence[str] = ("", PANEL)) -> list[str]:
+    """Return a file name without extension for each view, so that no two pictures, whose names have these ends, clash.
 
     It is the view's own name without its folder, or with the folders if two views would share it. Case is ignored, as
     by some file systems. Pass all views whose pictures go into one folder in one call.
@@ -57,7 +57,7 @@ def file_names(views: Sequence[str]) -> list[str]:
         offered = [short.name] if shared[short.name.casefold()] == 1 else []
         offered += [full, "_".join(path.parts)]
         for name in chain(offered, (f"{full}_{number}" for number in count(2))):
-            files = {name.casefold(), f"{name}{PANEL}".casefold()}
+            files = {f"{name}{end}".casefold() for end in ends}
             if not files & taken:
                 break
         taken |= files

@@ -148,14 +148,16 @@ def render_run(
         path = interpolate_cameras([view.camera for view in scene.train], frames)
         views = [Viewpoint(f"{i:04d}", camera) for i, camera in enumerate(path)]
     elif what == "error":
-        views = [view for split, group in measured_views(scene).items() if split != "train" for view in group]
+        # Views without a photograph are numbered anew around the cameras: their split tells them apart.
+        new = [(split, of) for split, of in measured_views(scene).items() if split != "train"]
+        views = scene.test or [replace(view, name=f"{split}_{view.name}") for split, of in new for view in of]
     else:
         views = scene.test if what == "test" else scene.train
     if not views:
         raise ValueError(f"the scene of {run} has no test view: give --what train or --what flight.")
-    folder, names = out or run / f"render_{what}", file_names([view.name for view in views])
-    endings = ["", *(["_error"] if what == "error" else []), *(["_mask"] if mask is not None else [])]
-    files = [f"{name}{end}.png" for name in names for end in endings]
+    ends = ["", *["_error"] * (what == "error"), *["_mask"] * (mask is not None)]
+    folder, names = out or run / f"render_{what}", file_names([view.name for view in views], ends)
+    files = [f"{name}{end}.png" for name in names for end in ends]
     flown = (folder / files[0]).exists()  # the film of an earlier flight is beside its pictures
     films = ["flight.mp4", "flight.webp"] if what == "flight" and not flown else []
     check_output(folder, None, [*(file for file in files if not is_own_png(folder / file)), *films])

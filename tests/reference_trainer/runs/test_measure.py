@@ -230,3 +230,20 @@ def test_where_a_run_is_expected_to_be_wrong(run, tmp_path):
     assert 0 < mask.mean() < 1
     render_run(out, "error", tmp_path / "no_mask")
     assert len([*(tmp_path / "no_mask").iterdir()]) == 2 * len(scene.test)
+
+
+@pytest.mark.parametrize(
+    ("test", "found"),
+    [
+        (("r.png", "r_error.png", "a/r_mask.png"), ["a_r_mask", "r", "r_error.png"]),
+        ((), ["around_000", "around_001", "around_002", "between_000", "between_001"]),
+    ],
+)
+def test_no_picture_of_an_expected_error_takes_the_place_of_a_render(test, found, run, tmp_path, monkeypatch):
+    trainer = measure_module.load_run(run[0])
+    views = tuple(dataclasses.replace(v, name=name) for v, name in zip(trainer.scene.test, test, strict=False))
+    trainer.scene = dataclasses.replace(trainer.scene, test=views)
+    monkeypatch.setattr(measure_module, "load_run", lambda *arguments, **trust: trainer)
+    render_run(run[0], "error", tmp_path, mask=0.1)
+    ends = "", "_error", "_mask"
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(f"{n}{end}.png" for n in found for end in ends)
