@@ -165,9 +165,9 @@ def render_run(
     images = []
     for name, view in zip(names, views, strict=True):
         with threads_for(view.camera.width * view.camera.height):
-            image = model.test_rendering(view.to(device)).image
-        images.append(image.clamp(0, 1).cpu())
-        save_png(folder / f"{name}.png", images[-1])
+            image = model.test_rendering(view.to(device)).image.clamp(0, 1).cpu()
+        images += [image] * (what == "flight")  # hundreds of large photographs would not fit into memory
+        save_png(folder / f"{name}.png", image)
         if maps is not None:
             found = maps(view)
             _log.info("%s: expected %.1f dB, %.1f to %.1f", view.name, found.psnr, *found.interval)
