@@ -52,7 +52,8 @@ def natural_order(config: TrainConfig) -> tuple[int, bool]:
         >>> natural_order(TrainConfig(noise=0.8)) < natural_order(TrainConfig(dropout=0.2, noise=0.8))
         True
     """
-    kinds = set(re.sub(r"\([^)]*\)", "", config.regularizers).replace("+", " ").split())
+    # Without their arguments, which may be schedules with arguments of their own.
+    kinds = set(re.sub(r"\((?:[^()]|\([^()]*\))*\)", "", config.regularizers).replace("+", " ").split())
     order = [set(), {"dropout"}, {"noise"}, {"dropout", "noise"}, kinds]
     other = (config.loss, config.density) != (_USUAL.loss, _USUAL.density)
     # `kinds` itself closes the list: any other combination gets its index.

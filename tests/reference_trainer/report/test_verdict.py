@@ -8,6 +8,7 @@ from reference_trainer.report.verdict import (
     differences,
     natural_name,
     natural_order,
+    run_colors,
     score_columns,
     unique_names,
     verdict,
@@ -38,6 +39,9 @@ def test_runs_are_called_and_ordered_as_people_do():
     assert natural_order(configs[-1]) > natural_order(configs[4])
     assert natural_order(TrainConfig(regularizer="density + noise(0.8)")) > natural_order(configs[4])  # no noise alone
     assert natural_order(TrainConfig(regularizer="noise + dropout(0.2)")) == natural_order(configs[4])
+    ramp = TrainConfig(regularizer="dropout(ramp(0.0, 0.2, 0, 10_000))")
+    assert natural_order(ramp) == natural_order(configs[1])
+    assert run_colors([ramp]) == run_colors(configs[1:2])
 
 
 @pytest.mark.parametrize(
