@@ -193,7 +193,8 @@ def pictures_of(
         half = avg_pool2d(expected.error[None], 2, ceil_mode=True)[0]  # it is smooth, and a third of the size
         found["expected error"] = heat_uri(expected_error_picture(expected._replace(error=half)))
         low, high = expected.interval
-        said.append(f"expected {'' if said else 'PSNR '}{expected.psnr:.1f} dB ({low:.1f} to {high:.1f})")
+        if not math.isnan(expected.psnr):
+            said.append(f"expected {'' if said else 'PSNR '}{expected.psnr:.1f} dB ({low:.1f} to {high:.1f})")
     if result is not None and result.reason is Reason.OK:
         found["co-adaptation"] = heat_uri(ca_picture(result))
         said.append(f"exact CA {result.value * 1e3:.2f}e-3")

@@ -219,7 +219,7 @@ def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Pa
     scenes = dict.fromkeys(options.path for options, _ in configs.values())
     notes = [note for scene in scenes for note in left_out(Path(scene))]
     notes += [note for each in found for note in each.notes]
-    notes += [f"{label}: no scores, it has not been trained to its end." for label in runs.keys() - results.keys()]
+    notes += [f"{label}: no scores, it has not been trained to its end." for label in runs if label not in results]
     curves, missing = _curves(runs)
     middle = next((each.heat.mean for each in found if each.heat is not None), 1.0)
     low, high = (end * middle for end in PER_WEIGHT_SCALE)
@@ -409,6 +409,8 @@ def _hanging(each: Findings, run: Path, options: SceneOptions) -> list[str]:
     lines = [f"{each.label}: {line}" for line in each.removed]
     if each.hangs is None:
         return lines
+    if not (run / PLY).exists():
+        return [*lines, f"{each.label}: {each.hangs} They can be removed once it has been trained to its end."]
     command = ["ca-reg", "clean", str(run / PLY), "--scene", options.path, "--hanging"]
     for name, usual in dataclasses.asdict(SceneOptions()).items():
         if (x := getattr(options, name)) != usual and name not in ("path", "init"):  # a PLY is its own beginning

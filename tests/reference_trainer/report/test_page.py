@@ -16,10 +16,11 @@ from reports import Parsed, two_of_each, unfinished
 
 from ca_reg.monitor import LOG_NAME, read_dynamics
 from reference_trainer.cli import main
+from reference_trainer.evaluation.error_maps import ErrorMaps
 from reference_trainer.evaluation.results import write_json
 from reference_trainer.evaluation.shares import Heat, blend_weights, mean_shares, share_per_weight
 from reference_trainer.report import page as page_module
-from reference_trainer.report.findings import find
+from reference_trainer.report.findings import find, pictures_of
 from reference_trainer.report.packing import quantized
 from reference_trainer.report.page import compare_two, write_report
 from reference_trainer.runs.folder import CONFIG, run_settings
@@ -147,6 +148,18 @@ def test_the_page_tells_what_hangs_and_how_to_remove_it(run, found, tmp_path, mo
     assert "after step 9" in first
     assert "1 of 2 Gaussians hang" in line
     assert f"ca-reg clean {run[0]}/point_cloud.ply --scene synthetic --hanging --downscale 8" in line
+    shutil.copytree(run[0], tmp_path / "unfinished", ignore=shutil.ignore_patterns("*.ply"))
+    of = dataclasses.replace(found, **hangs)
+    (unfinished,) = {*strategies(of, [tmp_path / "unfinished"], tmp_path, monkeypatch)["evidence"]} - {*none, first}
+    assert "ca-reg clean" not in unfinished
+
+
+def test_a_mask_that_leaves_no_pixel_leaves_nothing_to_expect(run):
+    model, scene = load_run_model(run[0])
+    view = dataclasses.replace(scene.test[0], mask=torch.zeros_like(scene.test[0].image[0]))
+    shown = pictures_of(model, view, ErrorMaps(model)(view, view.mask))
+    assert "expected error" in shown
+    assert shown["caption"] == ""
 
 
 def test_the_models_are_those_of_the_runs(pair):
