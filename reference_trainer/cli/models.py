@@ -207,7 +207,7 @@ class View:
 
     def __call__(self) -> None:
         from reference_trainer.runs.measure import load_run_model
-        from reference_trainer.runs.ply import load_for_views
+        from reference_trainer.runs.ply import ModelWithViews, load_for_views
         from reference_trainer.scenes.virtual_cameras import measured_views
         from reference_trainer.viewer.window import Viewer
 
@@ -216,14 +216,17 @@ class View:
         # First of all: a port in use, or a missing viser, is refused before anything is compiled or loaded.
         with Viewer(self.port) as viewer:
             self.rendering.begin(self.device, trains=True)  # so that no later picture waits for the compiler
+            first: ModelWithViews | None = None
             for run in self.runs:
                 where = scene_or_orbit(run, self.scene, self.orbit)
                 if where is None:
                     model, scene = load_run_model(run, **shared)
-                    viewer.show(model, measured_views(scene), str(run))
+                    loaded = ModelWithViews(model, 1.0, measured_views(scene), scene, {})
                 else:
                     loaded = load_for_views(run, where, background=self.scene.background, **shared)
-                    viewer.show(loaded.model, loaded.views, str(run))
+                first = first or loaded
+                shown = loaded.beside(first)
+                viewer.show(shown.model, shown.views, str(run))
             print(f"{viewer}; Ctrl-C ends it.", flush=True)
             viewer.serve()
 

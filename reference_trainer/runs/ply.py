@@ -141,6 +141,18 @@ class ModelWithViews:
     scene: Scene | None  # None for an orbit
     about: dict[str, object]  # entries about all this for a file of results
 
+    def beside(self, first: ModelWithViews) -> ModelWithViews:
+        """Return it as it stands beside another one, with the same cameras: at the size of that.
+
+        Without a scene of its own, its views and its background are those of the other one, too.
+        """
+        if self.scene is not None and self.enlarged == first.enlarged:
+            return self
+        background = (first if self.scene is None else self).model.background
+        gaussians = scaled(self.model.gaussians, first.enlarged / self.enlarged)
+        model = replace(self.model, gaussians=gaussians, background=background)
+        return replace(self, model=model, enlarged=first.enlarged, views=first.views)
+
 
 def load_for_views(
     ply: Path,

@@ -10,6 +10,7 @@ from commands import plain, refused
 
 from reference_trainer.cli import main
 from reference_trainer.evaluation import tables
+from reference_trainer.model.ply import load_ply, save_ply
 from reference_trainer.runs import measure as measure_module
 from reference_trainer.runs import ply as ply_module
 from reference_trainer.runs import run as run_module
@@ -45,6 +46,25 @@ def test_a_run_or_a_ply_is_shown_until_ctrl_c(what, trained, capsys, monkeypatch
     assert re.search(r"http://127\.0\.0\.1:\d+, .*Ctrl-C", capsys.readouterr().out)
     assert [bool(image.std() > 0) for image in shown] == [True] * len(what)
     assert "1 model to show, or 2" in refused(["view", str(trained), str(trained)], capsys)
+
+
+@pytest.mark.parametrize("second", [None, "part.ply"])
+def test_models_side_by_side_have_one_size(second, trained, tmp_path, monkeypatch):
+    """Although tiny ones without a scene are enlarged, each to the same radius."""
+    pytest.importorskip("viser")
+    gaussians = ply_module.scaled(load_ply(trained / "point_cloud.ply").gaussians, 0.02)
+    save_ply(gaussians, tmp_path / "tiny.ply")
+    save_ply(gaussians[: len(gaussians) // 2], tmp_path / "part.ply")
+    extents, whole = [], (gaussians.means[0] - gaussians.means[1]).norm()
+
+    def shows(viewer, model, views, name):
+        extents.append(((model.gaussians.means[0] - model.gaussians.means[1]).norm() / whole).item())
+
+    monkeypatch.setattr(Viewer, "show", shows)
+    monkeypatch.setattr(Viewer, "serve", lambda viewer: None)
+    main(["view", str(tmp_path / "tiny.ply"), str(tmp_path / second if second else trained), "--port", "0"])
+    assert extents[0] > 1
+    assert extents[1] == pytest.approx(extents[0] * (1 if second else 50), rel=1e-4)
 
 
 @pytest.mark.parametrize("arguments", [["garden"], ["--path", "garden"], ["garden", "--path", "garden"]])
