@@ -12,7 +12,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from reference_trainer.evaluation.pictures import comparison_figure, dynamics_figure, file_names
+from reference_trainer.evaluation.pictures import comparison_figure, dynamics_figure, file_names, is_own_png
 from reference_trainer.evaluation.results import machine, write_json
 from reference_trainer.evaluation.tables import comparison_table
 from reference_trainer.files import write_text
@@ -222,10 +222,13 @@ def _report(comparison: Comparison, out: Path) -> None:
     try:
         for split in sorted(splits - {"train"}) or splits:
             for name in file_names([view["name"] for view in views if view["split"] == split]):
-                figures.append(out / f"{split}_{name}.png")
-                comparison_figure(first, figures[-1], view=name, split=split)
-        more = f" and {len(figures) - 1} more" * (len(figures) > 1)
-        _log.info("every view under each strategy: %s%s", figures[0], more)
+                if is_own_png(figure := out / f"{split}_{name}.png"):
+                    comparison_figure(first, figure, view=name, split=split)
+                    figures.append(figure)
+                else:
+                    _log.info("%s is not from here, and is kept.", figure)
+        such = "".join(f", such as {path}" for path in figures[:1])
+        _log.info("every view under each strategy: %d pictures%s", len(figures), such)
     except FileNotFoundError as error:  # somebody has deleted them
         _log.info("no pictures of the views under each strategy: %s", error)
     _log.info(

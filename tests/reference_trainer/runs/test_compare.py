@@ -256,7 +256,9 @@ def test_runs_without_a_measurement_get_their_pictures_all_the_same(tmp_path, li
         if lines is not None:
             (folder / LOG_NAME).write_text(lines)
     comparisons = {out: Comparison({"baseline": [results], "dropout": [results]}, {})}
+    (out / "test_a_r_0.png").write_bytes(b"somebody else's")
     report(comparisons)
+    assert (out / "test_a_r_0.png").read_bytes() == b"somebody else's"
     assert any(line.startswith("no figure of CA and PSNR") for line in said)
     assert sorted(path.name for path in out.glob("*.png")) == ["test_a_r_0.png", "test_b_r_0.png"]
     (logs,) = (line for line in said if "tensorboard" in line)
