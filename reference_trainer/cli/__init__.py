@@ -84,6 +84,8 @@ def log_shown() -> Iterator[None]:
     """Show the messages of the trainer, and warnings of other packages, while a command runs."""
     root, trainer, shown = logging.getLogger(), logging.getLogger("reference_trainer"), _Shown()
     level = trainer.level
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names of old archives are not all UTF-8, nor is every terminal
+        sys.stdout.reconfigure(errors="backslashreplace")
     root.addHandler(shown)
     trainer.setLevel(logging.INFO)
     try:

@@ -1,6 +1,9 @@
 """What every command has: help, errors in one line, devices, and the ends that it may come to."""
 
 import dataclasses
+import io
+import logging
+import os
 import re
 import shutil
 import socket
@@ -288,6 +291,14 @@ def test_an_interruption(monkeypatch, capsys, tmp_path):
         main(["train", "--out", str(tmp_path)])
     assert exit_.value.code == 130
     assert "the same command" in capsys.readouterr().err
+
+
+def test_a_name_that_the_terminal_cannot_show_stops_nothing(monkeypatch):
+    shown = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, encoding="utf-8", errors="strict"))
+    with cli.log_shown():
+        logging.getLogger("reference_trainer").info("photo\udcff.jpg")
+    assert shown.getvalue() == rb"photo\udcff.jpg" + os.linesep.encode()
 
 
 def test_the_real_arguments_are_the_default(monkeypatch, capsys):
