@@ -13,7 +13,7 @@ from torch import Tensor
 
 from reference_trainer.evaluation.evaluate import Evaluation, evaluate
 from reference_trainer.evaluation.shares import Heat, all_but_highest, guard
-from reference_trainer.evaluation.tables import EXACT, markdown_table
+from reference_trainer.evaluation.tables import QUANTITIES, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.files import replacing
 from reference_trainer.model.ply import save_ply
@@ -213,8 +213,8 @@ def _table(found: dict[str, Evaluation]) -> str:
     for name, evaluation in found.items():
         row: dict[str, object] = {"model": name, "Gaussians": evaluation.gaussians}
         for split in dict.fromkeys(view.split for view in evaluation.views):
-            psnr, exact = evaluation.mean(split, "psnr"), evaluation.mean(split, "ca_exact_half") * 1e3
-            row |= {f"{split} PSNR (dB)": f"{psnr:.2f}", f"{split} {EXACT}": f"{exact:.2f}"}
+            for name in ("psnr", "ca_exact_half"):
+                row[f"{split} {QUANTITIES[name].title}"] = QUANTITIES[name].text([evaluation.mean(split, name)])
         rows.append(row)
-    known = [title for title in rows[0] if any(row[title] != "nan" for row in rows)]
+    known = [title for title in rows[0] if any(row[title] != "n/a" for row in rows)]
     return markdown_table(rows, known)

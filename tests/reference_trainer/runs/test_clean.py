@@ -75,6 +75,8 @@ def test_without_a_scene_a_model_is_cleaned_as_large_as_it_was(run, tmp_path, sa
     assert any("close the holes" in text for text in said)
     assert "orbit exact CA (1e-3)" in said[-2]
     assert "PSNR" not in said[-2]
+    clean_ply(tmp_path / "small.ply", orbit, tmp_path / "few.ply", fraction=0.9995)  # of which nothing has a score
+    assert "| n/a |" in said[-2]
     means = load_ply(tmp_path / "c.ply").gaussians.means
     assert len(means) == len(small) - round(0.1 * len(small))
     assert torch.cdist(means.double(), small.means.double()).amin(1).max() < 1e-5 * small.means.abs().max()
