@@ -141,7 +141,7 @@ def compare_two(first: Path, second: Path) -> tuple[list[dict[str, object]], lis
         ValueError: if one has not been trained to its end, its seeds differ in more than the seed, or the two were not
             measured at the same views of one scene.
     """
-    both, configs = [], {}
+    both, viewed, configs = [], [], {}
     for folder in (first, second):
         seeds = [] if (folder / CONFIG).is_file() else sorted(path.parent for path in folder.glob(f"seed_*/{CONFIG}"))
         if not seeds:
@@ -154,11 +154,16 @@ def compare_two(first: Path, second: Path) -> tuple[list[dict[str, object]], lis
             raise ValueError(f"the runs of {folder} differ in more than the seed: give one of them.")
         configs[str(folder)] = settings[0]
         both.append([read_results(run) for run in runs])
+        seen = [{(of["scene"], view["split"], view["name"]) for view in of["views"]} for of in both[-1]]
+        if any(each != seen[0] for each in seen):
+            raise ValueError(f"the runs of {folder} were not measured at the same views: give one of them.")
+        viewed.append(seen[0])
     if len(configs) < 2:
         raise ValueError(f"expected two different runs, got {first} twice.")
-    viewed = [{(runs[0]["scene"], view["split"], view["name"]) for view in runs[0]["views"]} for runs in both]
-    # A split whose views differ is left out as a whole: a mean over other views is another quantity.
+    # A split whose views differ is left out as a whole: a mean over other views is another quantity. Cameras between
+    # and around the training views have numbers alone, and stand elsewhere if those differ.
     other = {split for _, split, _ in viewed[0] ^ viewed[1]}
+    other |= {split for _, split, _ in viewed[0] if split != "test"} if "train" in other else set()
     shared = {split for _, split, _ in viewed[0] & viewed[1]} - other
     if not shared:
         raise ValueError(f"{first} and {second} were not measured at the same views of one scene.")

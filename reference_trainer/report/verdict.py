@@ -188,9 +188,11 @@ def verdict(strategies: Sequence[Rows], other: Sequence[str] = ()) -> tuple[str,
     split = "test" if all(tested) else "around"
     where = f"on the {tested[0]} test view{'s' * (tested[0] != 1)}" if all(tested) else "around the training views"
     limits = [] if all(tested) else ["Without test views, nothing is known about the quality at unseen views."]
-    if len({frozenset(view["name"] for view in run["views"] if view["split"] == "test") for run in runs}) > 1:
+    # Cameras around the training views have numbers alone, and stand elsewhere if those differ.
+    kind, done = ("test", "tested") if any(tested) else ("train", "trained")
+    if len({frozenset(view["name"] for view in run["views"] if view["split"] == kind) for run in runs}) > 1:
         where = "each on its own test views" if all(tested) else where
-        limits += ["The runs were not tested on the same views, so their scores on them cannot be compared."]
+        limits += [f"The runs were not {done} on the same views, so these scores cannot be compared."]
     if not rest:
         psnr, ca = (reference.mean(split, key) for key in ("psnr", "ca_exact_half"))
         found = [f"PSNR {psnr:.2f} dB"] * math.isfinite(psnr) + [f"exact CA {ca * 1e3:.2f}e-3"] * math.isfinite(ca)

@@ -347,11 +347,12 @@ def test_the_scores_of_a_comparison_are_those_of_all_its_seeds(run, tmp_path):
     assert re.match(r"Dropout 0\.2: a PSNR .*\(1\.50 dB higher\)", data["verdict"])
 
 
-def trained(folder: Path, seed: int, psnr: float, *, test=("test_0",), **settings) -> Path:
+def trained(folder: Path, seed: int, psnr: float, *, test=("test_0",), train="train_0", **settings) -> Path:
     """The folder of a run with these scores."""
     config = TrainConfig(seed=seed, **settings)
-    views = [{"name": name, "split": "test"} for name in test] + [{"name": "train_0", "split": "train"}]
-    mean = {"test": {"psnr": psnr}, "train": {"psnr": psnr + 9}}
+    views = [{"name": name, "split": "test"} for name in test] + [{"name": train, "split": "train"}]
+    views.append({"name": "000", "split": "between"})
+    mean = {"test": {"psnr": psnr}, "train": {"psnr": psnr + 9}, "between": {"ca_exact_half": 0.004}}
     results = {"scene": "fern", "config": dataclasses.asdict(config), "seconds": 1.0, "gaussians": 7, "mean": mean}
     write_json(folder / CONFIG, run_settings(SceneOptions(), config))
     write_json(folder / "results.json", results | {"views": views})
@@ -376,6 +377,9 @@ def test_two_trainings_side_by_side(tmp_path, capsys):
     rows, notes = compare_two(tmp_path / "plain/seed_0", other)
     assert not any(str(row["score"]).startswith("test") for row in rows)
     assert any("not compared" in note.lower() and "test" in note for note in notes)
+    other = trained(tmp_path / "elsewhere", 0, 25.0, train="train_1")  # and between other cameras, of the same numbers
+    rows, _ = compare_two(tmp_path / "plain/seed_0", other)
+    assert {str(row["score"]).split()[0] for row in rows} == {"test", "Gaussians", "seconds"}
 
 
 def test_what_cannot_be_compared_is_refused(tmp_path):
@@ -387,6 +391,9 @@ def test_what_cannot_be_compared_is_refused(tmp_path):
     trained(seeds / "seed_0", 0, 20.0)
     trained(seeds / "seed_1", 1, 20.0, dropout=0.1)
     with pytest.raises(ValueError, match="more than the seed"):
+        compare_two(run, seeds)
+    trained(seeds / "seed_1", 1, 20.0, test=("test_0", "test_1"))  # of a photograph that came later
+    with pytest.raises(ValueError, match="same views"):
         compare_two(run, seeds)
     (seeds / "seed_0/results.json").unlink()
     (seeds / "seed_1/results.json").unlink()
