@@ -100,7 +100,7 @@ def write_report(
         raise ValueError(f"expected at least 1 view of each split, got {views}.")
     folders, runs = runs, [run for folder in runs for run in runs_of(folder) or [folder]]
     path_of = dict(zip(runs, labels(runs), strict=True))
-    out = report_file(folders, out)
+    file = report_file(folders, out)
     for run in runs:
         check_run(run)
     configs = {run: read_run_settings(run / CONFIG)[1] for run in runs}
@@ -119,6 +119,7 @@ def write_report(
     # The page names the command that makes it again, without what is usual.
     command = ["ca-reg", "report", *map(str, folders)]
     command += ["--views", str(views)] * (views != VIEWS) + ["--trust", *sorted(trust)] * bool(trust)
+    command += ["--out", str(out)] * (out is not None)
     data["made"] = f"{shlex.join(command)} · ca_reg {ca_reg.__version__} · {datetime.now():%Y-%m-%d %H:%M}"
     page = Template(_part("page.html")).substitute(
         title=escape(f"{found[0].scene.name}: {', '.join(names)}", quote=False),
@@ -126,9 +127,9 @@ def write_report(
         data=json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c"),  # nothing ends the script
         script=_part("models.js") + _part("curves.js") + _part("page.js"),
     )
-    write_text(out, page)
-    _log.info("The report is %s (%.1f MB): open it in a browser", out, out.stat().st_size / 1e6)
-    return out
+    write_text(file, page)
+    _log.info("The report is %s (%.1f MB): open it in a browser", file, file.stat().st_size / 1e6)
+    return file
 
 
 def compare_two(first: Path, second: Path) -> tuple[list[dict[str, object]], list[str]]:

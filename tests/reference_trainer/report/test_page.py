@@ -83,7 +83,7 @@ def test_the_tables_are_those_of_the_runs(pair):
         assert column["cells"][i]["text"] == f"{results['mean']['test']['psnr']:.2f}"
         assert f"{name}: 11 steps with dropout(0.2) + noise(0.3" in " ".join(page.data["about"])
         assert f"| {name} | " in page.data["attribution"]
-    assert page.data["made"].startswith(f"ca-reg report {runs[0]} {runs[1]} --views 2 · ")
+    assert page.data["made"].startswith(f"ca-reg report {runs[0]} {runs[1]} --views 2 --out ")
     assert "| noise | 0.3 | 0.0 |" in page.data["settings"]
     assert "\n| sh_rate |" not in page.data["settings"]  # the default in both
 
