@@ -23,10 +23,9 @@ except ImportError as error:
 
 from reference_trainer.cli.listing import registry
 from reference_trainer.cli.models import Bake, Clean, Diff, Evaluate, Render, Report, View
-from reference_trainer.cli.options import refuse_old_options
 from reference_trainer.cli.photos import Run
 from reference_trainer.cli.setup import Names, Poses, Recipes, Version, Warmup
-from reference_trainer.cli.studies import MOVED, Study
+from reference_trainer.cli.studies import Study
 from reference_trainer.cli.training import Compare, Demo, Plan, Train, given_fields
 from reference_trainer.devices import check_device
 from reference_trainer.training.config import TrainConfig
@@ -97,10 +96,7 @@ def log_shown() -> Iterator[None]:
 
 def parse_command(arguments: Sequence[str]) -> Any:
     """Return the command with its options; exits if they cannot be parsed."""
-    if arguments[:1] == ["study"] and (moved := MOVED.get("".join(arguments[1:2]))):
-        raise ValueError(f"study {arguments[1]} is now {moved}, called from a checkout of the repository.")
     usual = TrainConfig()
-    refuse_old_options(arguments, [usual.renderer, *(f"--{name}" for name in vars(usual))])
     # The recipe and its length decide on the defaults that tyro shows and fills in: they are read before tyro reads.
     peek = argparse.ArgumentParser(prog="ca-reg", add_help=False, allow_abbrev=False)
     peek.add_argument("--recipe", nargs="?")

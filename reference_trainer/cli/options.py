@@ -19,22 +19,8 @@ from reference_trainer.scenes.options import OrbitOptions, SceneOptions
 
 __all__ = [
     "Device", "Orbit", "PlyScene", "RenderOptions", "Rendering", "Trust", "check_model", "check_out", "check_ply",
-    "check_scenes", "refuse_old_options", "scene_or_orbit",
+    "check_scenes", "scene_or_orbit",
 ]  # fmt: skip
-
-_OLD = {
-    ("--renderer", "torch"): "the renderer of this package is called builtin: --renderer builtin",
-    ("--engine", "loops"): "this engine is called by what compiles it: --engine numba",
-    ("--fields", None): "models that train side by side are called models: --models",
-    ("--preset", None): "it is --recipe now, and what was the preset fsgs is --recipe 3dgs",
-    ("--ply", None): "a PLY is given without an option: ca-reg evaluate FILE.ply",
-    ("--compensate", None): "it is an argument of --regularizer: 'dropout(0.2, compensate=True)'",
-    ("--clip-noise", None): "it is an argument of --regularizer: 'noise(0.8, clip=True)'",
-    ("--scale-noise", None): "it is an argument of --regularizer: 'noise(0.8, scale=True)'",
-    ("--lambda-dssim", None): "it is an argument of --loss: 'photometric(lambda_dssim=0.2)'",
-    ("--ca-weight", None): "it is a term of --loss: 'photometric + co_adaptation(3.0)'",
-}
-"""Options, with the value that is refused or None for all, and what they are called now."""
 
 Device = Annotated[str, tyro.conf.arg(help='"cpu" or "cuda".')]
 Orbit = Annotated[OrbitOptions, tyro.conf.arg(name="orbit")]
@@ -147,16 +133,3 @@ def check_scenes(paths: Sequence[str]) -> None:
     for path in paths:
         if path != "synthetic" and not Path(path).exists():
             raise FileNotFoundError(f"there is no scene folder {path}; for the built-in scene, say 'synthetic'.")
-
-
-def refuse_old_options(arguments: Sequence[str], known: Sequence[str]) -> None:
-    """Refuse options and values of earlier versions with a ValueError that has their new names.
-
-    Those that are ``known`` are in use: what is old here may not be everywhere yet.
-    """
-    # --engine=loops is taken apart like --engine loops, so that a value always follows its option.
-    words = [part for word in arguments for part in (word.split("=", 1) if word.startswith("--") else [word])]
-    for (option, value), now in _OLD.items():
-        for word, after in zip(words, [*words, ""][1:], strict=True):
-            if word.replace("_", "-") == option and value in (None, after) and (value or option) not in known:
-                raise ValueError(f"{option}{f' {value}' if value else ''} is a name of earlier versions: {now}.")

@@ -12,14 +12,7 @@ from reference_trainer.cli.options import Device, Trust, check_model
 from reference_trainer.files import is_ply
 from reference_trainer.scenes.options import OrbitOptions
 
-__all__ = ["MOVED", "ErrorRuntime", "Stability", "Study"]
-
-MOVED = {
-    "paper": "python -m benchmarks.paper",
-    "attribution": "python -m benchmarks.attribution",
-    "gaussian-shares": "python -m benchmarks.attribution",
-}
-"""Former studies, which are evidence and no part of the installation: how they are called from a checkout."""
+__all__ = ["ErrorRuntime", "Stability", "Study"]
 
 
 @dataclass(frozen=True)
