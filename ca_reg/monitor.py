@@ -57,7 +57,8 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
         every: number of steps between measurements, at least 1.
         last_step: the last step of the training, measured in any case.
         psnr: ``psnr(opacity, view)`` returns the PSNR in dB of the view rendered with these opacities, already scaled
-            by ``1 - p`` for test time. Called without gradients. None leaves PSNR out.
+            by ``1 - p`` for test time. Called without gradients. Views where it is not finite, such as one that a mask
+            leaves no pixel of, do not count. None leaves PSNR out.
         details: ``details(opacity, view)`` returns, by name, what TensorBoard shows of the first view of each group
             besides the curves: images (3, H, W) in [0, 1], and numbers (N,) as histograms. Called without gradients.
         sinks: where the same goes besides TensorBoard, such as :class:`ca_reg.sinks.WandbSink`; closed at the end.
@@ -180,10 +181,10 @@ class CAMonitor(AbstractContextManager["CAMonitor"]):
 
     @torch.no_grad()
     def _mean_psnr(self, psnr: Callable[[Tensor, Any], float], opacity: Tensor, group: list[Any]) -> float | None:
-        """Average the PSNR over views, with the test-time opacities; None if it is not finite."""
+        """Average the PSNR over the views where it is finite, with the test-time opacities; None if it is nowhere."""
         scaled = scale_opacity(opacity, self.score.p)
-        mean = sum(float(psnr(scaled.clone(), view)) for view in group) / len(group)  # it may edit its opacities
-        return mean if math.isfinite(mean) else None
+        found = [x for view in group if math.isfinite(x := float(psnr(scaled.clone(), view)))]  # it may edit its copy
+        return sum(found) / len(found) if found else None
 
     @torch.no_grad()
     def _show(self, opacity: Tensor, step: int) -> None:

@@ -134,6 +134,8 @@ def test_groups_without_a_value_are_null_with_a_reason(tmp_path):
     assert record["ca_reason/test"] == "EMPTY"
     assert record["ca_empty_views/test"] == 1
     assert record["psnr/test"] is None
+    monitor = make(tmp_path / "masked", views={"test": [0.0, 1, 2]}, psnr=lambda o, v: 20 + v if v else math.nan)
+    assert run(monitor, 10, 11)[0]["psnr/test"] == 21.5  # of a black mask there is none
     assert np.isnan(read_dynamics(tmp_path)["ca/test"]).all()
 
 
