@@ -2,17 +2,9 @@
 
 from pathlib import Path
 
-import pytest
-from commands import refused
-
 from reference_trainer.cli import main
 from reference_trainer.studies import error_runtime as error_runtime_module
 from reference_trainer.studies import study as study_module
-
-
-@pytest.mark.parametrize("name", ["paper", "attribution"])
-def test_a_study_that_moved_is_refused_with_its_new_name(name, capsys):
-    assert f"python -m benchmarks.{name}" in refused(["study", name, "--list"], capsys)
 
 
 def test_error_runtime(monkeypatch, tmp_path):
