@@ -25,8 +25,8 @@ __all__ = ["PORT", "Compare", "Demo", "Lpips", "Plan", "Train", "given_fields"]
 PORT = 8080
 """Default port of the viewer."""
 PICTURES_FROM = 400
-"""Smallest interval of measurements, in steps, at which pictures cost less than 2 % of a training: those of one
-measurement take the time of 7 steps (fern at 252x189, 40,110 Gaussians)."""
+"""Smallest interval of measurements, in steps, at which pictures cost less than 3 % of a training: those of one
+measurement take the time of about eleven (docs/view.md)."""
 
 Scene = Annotated[SceneOptions, tyro.conf.arg(name="scene")]
 Folder = Annotated[
@@ -125,7 +125,7 @@ class Train:
     """Steps between measurements of CA and PSNR for TensorBoard; 0 for none."""
     monitor_pictures: Literal["auto", "on", "off"] = "auto"
     """Show TensorBoard render, error, exact CA map and shares of the first view of each split as well; "auto": where
-    that costs less than 2 % of the time, with at least 400 steps between measurements."""
+    that costs less than 3 % of the time, with at least 400 steps between measurements."""
     log_to: tuple[Literal["wandb", "mlflow"], ...] = ()
     """Where curves and pictures go besides TensorBoard, as these are set up on this machine."""
     lpips: Lpips = None
