@@ -23,8 +23,8 @@ ModelScene = Annotated[PlyScene, tyro.conf.arg(name="scene")]
 class Evaluate:
     """Measure a run, or any 3DGS PLY: PSNR, SSIM, LPIPS, CA, CV.
 
-    Per view and mean, on the views of a scene. A PLY without a scene is measured from cameras on an orbit around it: CA
-    (exact, of the paper's protocol, and without the background) and CV.
+    Per view and mean, on the views of a scene. A PLY without a scene is measured from cameras on an orbit around it:
+    CA (exact, of the paper's protocol, and without the background) and CV.
     """
 
     run: Annotated[Path, tyro.conf.Positional]
@@ -270,8 +270,8 @@ class Clean:
 
     Removes those with the most co-adaptation per contribution, and prints a table of before and after. A few training
     steps on the photographs of the scene close the holes; without a scene, on an orbit, they stay. For models that were
-    trained without a regularizer: after dropout there is little to remove, and such a model is refused unless you say
-    --anyway. Those can be freed of what hangs before and beside the cameras (--hanging), without a photograph.
+    trained without a regularizer: after dropout there is little to remove, and without --anyway such a model is
+    refused. Those can be freed of what hangs before and beside the cameras (--hanging), without a photograph.
     """
 
     ply: Annotated[Path, tyro.conf.Positional]
