@@ -251,7 +251,8 @@ def _planned(
     plan = make_plan(scene, config, given=given, device=device)
     write_json(out / PLAN, plan.as_dict())
     for row in (each for each in plan.rows() if each["change"] != "-" or each["decision"] == "recommended"):
-        _log.info("plan: %s %s (%s): %s", row["item"], row["decision"], row["change"], row["reason"])
+        change = "" if row["change"] == "-" else f" ({row['change']})"
+        _log.info("plan: %s %s%s: %s", row["item"], row["decision"], change, row["reason"])
     _log.info("plan: all decisions, with reasons, are in %s", out / PLAN)
     return plan.applied(config, given=given)
 

@@ -471,7 +471,7 @@ def test_summary(finished):
 
 def test_a_run_says_what_is_recommended_and_not_done(options, short, tmp_path, said):
     run_experiment(options, dataclasses.replace(short, iterations=1, dropout=0.0), tmp_path, auto=True)
-    assert any(line.startswith("plan: dropout recommended (-): ") for line in said)
+    assert any(line.startswith("plan: dropout recommended: ") for line in said)
 
 
 def test_auto_trains_by_the_plan_and_keeps_it(options, short, tmp_path, said):
