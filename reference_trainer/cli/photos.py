@@ -139,7 +139,7 @@ class Run:
 
     def __call__(self) -> None:
         from reference_trainer.runs.distill import distilled
-        from reference_trainer.runs.run import run_experiment
+        from reference_trainer.runs.run import Monitoring, run_experiment
 
         self.rendering.choose(self.device)
         scene = self._photographs()
@@ -154,7 +154,10 @@ class Run:
             if not (self.folder / run.RESULTS).exists():
                 self._train_members(options, config)
             options, config = distilled(self._trained)
-        run_experiment(options, config, self.folder, auto=not several, device=self.device, progress=True)
+        run_experiment(
+            options, config, self.folder, auto=not several, device=self.device, progress=True,
+            monitoring=Monitoring(pictures=True),
+        )  # fmt: skip
         self._report()
 
     def _photographs(self) -> Path:

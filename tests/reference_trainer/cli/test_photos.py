@@ -97,6 +97,8 @@ def test_three_photographs_become_a_page(garden, tmp_path, capsys, monkeypatch):
     settings = json.loads((out / "config.json").read_text())["config"]
     assert (settings["dropout"], settings["opacity_decay"], settings["iterations"]) == (0.2, 0.995, 3)
     assert read_image(out / "views/train/train_0.png")[0].shape == (3, 30, 40)
+    curves = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator").EventAccumulator(str(out))
+    assert curves.Reload().Tags()["images"]  # as docs/view.md says of runs/mine
 
     # What is finished stays, and nothing is written again.
     finished = seen(out)
