@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import time
+from contextlib import suppress
 from dataclasses import replace
 
 import torch
@@ -14,6 +15,7 @@ from reference_trainer.progress import progress_bar
 from reference_trainer.render import describe_engine, render_moments, variance_shares
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes import synthetic_scene
+from reference_trainer.scenes.dense import dense_points
 from reference_trainer.scenes.images import resize_image
 from reference_trainer.scenes.scene import View
 from reference_trainer.threads import threads_for
@@ -30,8 +32,8 @@ _UNTIMED, _TIMED = 3, 9  # steps
 def warm_up() -> tuple[str, ...]:
     """Use every loop once per process, if the CPU engine is the loops; return the names of those that were compiled.
 
-    A training step of each kind and a score of each kind compile exactly the variants of the loops that are needed;
-    those in the disk cache are loaded from it.
+    A training step of each kind, a score of each kind and a dense start compile exactly the variants of the loops that
+    are needed; those in the disk cache are loaded from it.
     """
     if describe_engine("cpu") == "torch":
         return ()
@@ -74,8 +76,10 @@ def step_seconds(width: int, height: int, device: str = "cpu") -> float:
 
 
 def _use_everything() -> None:
-    """Take one training step of each kind and compute each score on a scene of a few pixels."""
+    """Measure points, take one training step of each kind and compute each score on a scene of a few pixels."""
     scene = synthetic_scene(width=8, height=6, points=20)
+    with suppress(ValueError):  # so few pixels give too few points
+        dense_points(scene.train)
     plain = TrainConfig(iterations=1, dropout=0.2)
     kinds = {"analytic": True}, {"density": "absgrad"}, {"loss": "photometric + smooth_depth(0.001)"}
     for config in (plain, *(replace(plain, **kind) for kind in kinds)):

@@ -47,7 +47,7 @@ GUIDES = 50  # points that a view must see to tell its range of depth
 ROUNDS = 3
 SIDE = 4  # pixels over which the sweep's depths give a slope
 NEAR, ALIKE = 1.5, 0.02  # pixels and share of the inverse depth within which two photographs agree
-BAR = {"desc": "points", "unit": "photo", "delay": 2.0}
+BAR = {"desc": "points", "unit": "photo", "delay": 2.0, "leave": False}
 SMALL, LARGE = 0.03, 0.35  # costs of a step between planes, where a correlation of -1 costs 1
 
 

@@ -230,11 +230,12 @@ except ImportError as error:
 
 
 def test_warmup_leaves_nothing_to_compile(tmp_path):
-    """With every loop that a training, a score or shares use; those of one file are then missing in a copy of them."""
+    """With all loops of a training, a score, shares and a dense start; those of one file are then missing in a copy."""
     pytest.importorskip("numba")
     script = """
 from reference_trainer.cli import main
 main(["warmup"])
+import reference_trainer.compiled.stereo
 from reference_trainer.compiled.compiling import KERNELS
 assert len(KERNELS) > 10
 print("unused:", [kernel.py_func.__qualname__ for kernel in KERNELS if not kernel.signatures])
