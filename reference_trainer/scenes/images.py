@@ -39,11 +39,12 @@ OTHER_PHOTOGRAPHS = frozenset(
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
 LARGEST_IMAGE = 100_000_000  # pixels: a header can announce any number, and each takes 25 bytes of memory
 LARGE_IMAGE = 500_000  # pixels: about a second per training step on a CPU; larger pictures are reduced
+ORIENTATION = 0x0112  # of EXIF data and TIFF files
 _BAND = 100_000  # pixels converted at a time
 
 
 def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
-    """Read an 8-bit image file, PNG, JPEG, BMP, TIFF or WebP by its content: colors and alpha, both in [0, 1], float32.
+    """Read an image file, PNG, JPEG, BMP, TIFF or WebP by its content: colors and alpha, both in [0, 1], float32.
 
     Colors are (3, H, W); alpha is (H, W), or None if the file has no transparency.
 
@@ -52,7 +53,7 @@ def read_image(path: str | Path) -> tuple[Tensor, Tensor | None]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if the file is not an image, is damaged, has more than 8 bits per channel or more than 100 million
+        ValueError: if the file is not an image, is damaged, is gray of more than 8 bits, or has more than 100 million
             pixels.
     """
     decoded = decode_image(path)
@@ -81,6 +82,7 @@ def decode_image(path: str | Path) -> Any:
     with opened_image(path) as file:
         if file.format == "TIFF":
             _check_strips(file)
+            file.getexif().pop(ORIENTATION, None)  # Pillow turns no other files
         return file.convert("RGBA" if has_alpha(file) else "RGB")
 
 
@@ -92,7 +94,8 @@ def has_alpha(image: Any) -> bool:
 def image_size(path: str | Path) -> tuple[int, int]:
     """Return the width and height of an image file, pixels, without decoding it; errors as for `read_image`."""
     with opened_image(path) as file:
-        return int(file.width), int(file.height)
+        # Of a TIFF with an orientation tag, Pillow has the size after turning it.
+        return (file.tag_v2[256], file.tag_v2[257]) if file.format == "TIFF" else (file.width, file.height)
 
 
 @contextmanager

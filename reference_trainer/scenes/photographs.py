@@ -7,7 +7,6 @@ import logging
 import shutil
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from reference_trainer.files import replacing
 from reference_trainer.scenes.images import (
     FORMATS,
     IMAGE_SUFFIXES,
+    ORIENTATION,
     OTHER_PHOTOGRAPHS,
     decode_image,
     has_alpha,
@@ -40,7 +40,8 @@ _BESIDE = frozenset(
     | {".bin", ".ply", ".npy", ".npz"}
 )
 """What programs keep beside photographs, and what scenes are made of: nobody takes them for photographs."""
-_ORIENTATION = 0x0112  # EXIF
+_CAMERA, _LENS, _FOCAL = (0x010F, 0x0110), 0x8769, (0x920A, 0xA405)
+"""EXIF: make and model; the group of tags, and of these the focal lengths, from which COLMAP knows that in pixels."""
 _JUDGED = 640  # pixels of the longer side at which sharpness is judged
 _log = logging.getLogger(__name__)
 
@@ -227,15 +228,21 @@ def _upright(path: Path) -> Any:
             raise ImportError(f"{path.name} needs pi-heif: pip install 'ca_reg[photos]'.") from error
         pi_heif.register_heif_opener()
     with opened_image(path, ("HEIF",) if kind in HEIC else FORMATS) as image:
-        if kind in _AS_THEY_ARE and image.getexif().get(_ORIENTATION, 1) == 1:
+        if kind in _AS_THEY_ARE and image.getexif().get(ORIENTATION, 1) == 1:
             return None
-        return ImageOps.exif_transpose(image.convert("RGBA" if has_alpha(image) else "RGB"))
+        turned = image.convert("RGBA" if has_alpha(image) else "RGB")
+        if image.format == "TIFF":  # whose EXIF data, among others, are tags of the file, too many for a JPEG
+            tags, kept = image.getexif(), turned.getexif()
+            kept.update((tag, tags[tag]) for tag in _CAMERA if tag in tags)
+            of_lens = tags.get_ifd(_LENS)
+            kept.get_ifd(_LENS).update((tag, of_lens[tag]) for tag in _FOCAL if tag in of_lens)
+            turned.info["exif"] = kept.tobytes()
+        return ImageOps.exif_transpose(turned)
 
 
 def _save(image: Any, path: Path) -> None:
     """Write a picture as JPEG or PNG, with its EXIF data."""
     exif = image.getexif()
-    with suppress(KeyError):
-        del exif[_ORIENTATION]
+    exif.pop(ORIENTATION, None)
     with replacing(path) as place:
         image.save(place, "PNG" if path.suffix == ".png" else "JPEG", quality=95, exif=exif)

@@ -7,9 +7,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, TiffImagePlugin
 
 from reference_trainer.scenes import photographs
+from reference_trainer.scenes.images import image_size, read_image
 from reference_trainer.scenes.photographs import (
     collect_photographs,
     sharpest_frames,
@@ -63,6 +64,23 @@ def test_what_colmap_reads_is_copied_and_the_rest_is_made_so(tmp_path):
             if tag != 2:
                 assert made.getexif().get(ORIENTATION, 1) == 1
                 assert made.getexif().get_ifd(0x8769)[FOCAL_35] == 28
+
+
+@pytest.mark.parametrize("tag", [1, 3, 6])
+def test_a_tiff_keeps_its_orientation_and_focal_length(tag, tmp_path):
+    """Of other programs it is turned by its tag, and its EXIF data are tags of the file among others."""
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[ORIENTATION], tags[0x8769], tags[0x010F], tags[700] = tag, {FOCAL_35: 28}, "maker", bytes(100_000)
+    path = saved(tmp_path / "a.tif", picture(), tiffinfo=tags)
+    assert np.array_equal(read_image(path)[0].permute(1, 2, 0).numpy(), picture() / np.float32(255))
+    assert image_size(path) == (96, 64)
+    assert collect_photographs([path], tmp_path / "out") == ["a.jpg"]
+    with Image.open(tmp_path / "out/a.jpg") as made:
+        expected = np.rot90(picture(), {1: 0, 3: 2, 6: 3}[tag]).astype(int)
+        assert made.size[::-1] == expected.shape[:2]
+        assert np.abs(np.asarray(made).astype(int) - expected).mean() < 5
+        assert made.getexif()[0x010F] == "maker"
+        assert made.getexif().get_ifd(0x8769)[FOCAL_35] == 28
 
 
 def test_what_cannot_be_read_is_named(tmp_path):
