@@ -159,13 +159,17 @@ def sharpest_frames(path: Path, count: int) -> Iterator[Any]:
         ValueError: if the file is no video or is damaged.
         ImportError: if PyAV is missing.
     """
+    # From its packets: a header may say nothing of the duration, and time need not begin at 0.
+    with _opened_video(path) as file:
+        shown = ((p.dts if p.pts is None else p.pts, p.time_base) for p in file.demux(video=0))
+        times = [float(time * base) for time, base in shown if time is not None and base is not None] or [0.0]
+    first, length = min(times), max(times) - min(times)
     with _opened_video(path) as file:
         stream = file.streams.video[0]
         stream.thread_type = "AUTO"
-        length = float((stream.duration or 0) * (stream.time_base or 0)) or (file.duration or 0) / 1e6
         part, best, sharpest = 0, None, -1.0
         for frame in file.decode(stream):
-            now = min(count - 1, int(count * (frame.time or 0.0) / length)) if length else 0
+            now = min(count - 1, int(count * ((frame.time or 0.0) - first) / length)) if length else 0
             if now > part and best is not None:
                 yield _of_video(best)
                 part, best, sharpest = now, None, -1.0

@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -228,22 +229,36 @@ def test_a_video_without_a_frame_is_named(tmp_path, monkeypatch):
     assert sort_photographs(tmp_path) == ([], {"clip.mp4": "it holds no pictures"})
 
 
-def test_of_every_part_of_a_video_the_sharpest_frame_is_taken(tmp_path, caplog):
+def film(path, start=0, **options):
+    """Write 24 frames of which three, in different thirds, have texture and levels of blue 40, 110 and 180."""
     av = pytest.importorskip("av", reason="needs ca_reg[photos]")
     texture = np.random.default_rng(0).integers(0, 256, (48, 64), dtype=np.uint8)
     sharp = {2: 0, 13: 1, 18: 2}  # frame of a part that has texture; the others are plain
-    with av.open(str(tmp_path / "clip.mp4"), "w") as file:
+    with av.open(str(path), "w", options=options) as file:
         stream = file.add_stream("mpeg4", rate=10, options={"qscale": "2"})
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
         for number in range(24):
             gray = texture if number in sharp else np.full_like(texture, 128)
             level = np.full((48, 64), 40 + 70 * sharp.get(number, 0), np.uint8)
             frame = av.VideoFrame.from_ndarray(np.stack([gray, gray, level], -1), format="rgb24")
+            frame.pts, frame.time_base = start + number, Fraction(1, 10)
             file.mux(stream.encode(frame))
         file.mux(stream.encode(None))
-    frames = [np.asarray(frame).astype(float) for frame in sharpest_frames(tmp_path / "clip.mp4", 3)]
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "options"), [("a.mp4", 0, {}), ("late.mp4", 500, {}), ("b.mkv", 0, {"live": "1"})]
+)
+def test_of_every_part_of_a_video_the_sharpest_frame_is_taken(name, start, options, tmp_path):
+    """Also of one that begins late, as clips of camcorders do, and of one whose header does not say how long it is."""
+    frames = [np.asarray(frame).astype(float) for frame in sharpest_frames(film(tmp_path / name, start, **options), 3)]
     assert [round((frame[..., 2].mean() - 40) / 70) for frame in frames] == [0, 1, 2]
     assert all(frame[..., 0].std() > 40 for frame in frames)
+
+
+def test_frames_of_a_video_are_collected_and_what_is_none_is_named(tmp_path, caplog):
+    film(tmp_path / "clip.mp4")
     with caplog.at_level("INFO"):
         assert collect_photographs([tmp_path / "clip.mp4"], tmp_path / "out", frames=3) == [
             "clip_0000.jpg", "clip_0001.jpg", "clip_0002.jpg"
