@@ -358,16 +358,18 @@ def read_cameras_text(path: Path) -> dict[int, ColmapCamera]:
 
 
 def read_images_text(path: Path) -> list[ColmapImage]:
-    """Read ``images.txt``, two lines for each image. Raises ValueError if it is damaged."""
+    """Read ``images.txt``, two lines for each image. Raises ValueError if it is damaged or a second one is missing."""
     lines = _lines(path, lines_each=2)
     images: list[ColmapImage] = []
     for number, line in lines:
         if not line and not images:  # blank lines at the beginning
             continue
-        next(lines, None)  # its features
+        _, features = next(lines, (0, ""))
         if not line:  # and at the end
             continue
         try:
+            if features and not features.rsplit(maxsplit=1)[-1].lstrip("-").isdecimal():  # they end in a point's number
+                raise ValueError(f"the line after it must hold its features, or be empty, and is {features[:80]!r}.")
             words = line.split(maxsplit=9)  # a name may contain spaces
             matrix = view_matrix_from_quaternion([*map(float, words[1:5])], [*map(float, words[5:8])])
             images.append(ColmapImage(int(words[0]), words[9], int(words[8]), matrix))

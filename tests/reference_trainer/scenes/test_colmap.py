@@ -97,6 +97,17 @@ def test_damaged_text_names_file_and_line(tmp_path, colmap_text):
         (tmp_path / name).write_text(whole)
 
 
+def test_an_image_in_place_of_features_is_refused(tmp_path, colmap_text):
+    """Scripts forget the second line of an image, which may be empty; every other image would be lost."""
+    colmap_text(tmp_path)
+    lines = (tmp_path / "images.txt").read_text().splitlines()
+    images = [line for line in lines if line.endswith(".png")]
+    assert len(images) == 3
+    (tmp_path / "images.txt").write_text("\n".join(images) + "\n")
+    with pytest.raises(ValueError, match=r"images\.txt, line 1.*features"):
+        read_colmap(tmp_path)
+
+
 def test_inconsistent_models_are_refused(tmp_path, colmap_text):
     colmap_text(tmp_path)
     images = (tmp_path / "images.txt").read_text()
