@@ -242,9 +242,10 @@ def _agree(one: tuple[str, ...], other: tuple[str, ...]) -> bool:
 def random_points(train: Sequence[Frame], count: int, generator: torch.Generator) -> PointCloud:
     """Draw gray points where the training cameras look.
 
-    They fill the NeRF-synthetic box if its center lies in all training pictures and all training cameras stand outside
-    it, else the cameras' frusta, between the scene file's depth bounds if it has any, else between a quarter and four
-    times the median depth of the point closest to all optical axes.
+    They fill the NeRF-synthetic box if its center lies in all training pictures, its edge is there a quarter as long as
+    these are wide, and all training cameras stand outside it, else the cameras' frusta, between the scene file's depth
+    bounds if it has any, else between a quarter and four times the median depth of the point closest to all optical
+    axes.
 
     Raises:
         ValueError: if the optical axes that must give the bounds do not meet in front of the cameras, or the bounds are
@@ -264,9 +265,10 @@ def random_points(train: Sequence[Frame], count: int, generator: torch.Generator
 
 
 def _looks_at_box(camera: Camera) -> bool:
-    """Whether the camera stands outside the NeRF-synthetic box and has its center, the origin, in the picture."""
-    outside = float(camera.position.abs().max()) > BLENDER_BOX
-    return outside and bool(camera.inside(*camera.project(torch.zeros(3))))
+    """Whether the camera stands outside the NeRF-synthetic box, has its center in the picture and is not far away."""
+    center, depth = camera.project(torch.zeros(3))
+    large = 2 * BLENDER_BOX * camera.fx >= 0.25 * camera.width * float(depth)  # not so in a world of millimeters
+    return large and float(camera.position.abs().max()) > BLENDER_BOX and bool(camera.inside(center, depth))
 
 
 def random_points_in_frusta(

@@ -141,6 +141,13 @@ def test_random_points_repeat_and_leave_the_global_state(target, in_box):
     assert (one.positions.abs().max().item() <= 1.3) == in_box
 
 
+def test_in_a_world_of_millimeters_random_points_are_no_speck_at_the_origin():
+    scale = 1000.0
+    looks = frames(looking((scale * camera.position).tolist(), [0.0, 0.0, 0.0]) for camera in CAMERAS)
+    points = random_points(looks, 500, torch.Generator().manual_seed(0)).positions
+    assert points.std(0).min() > 0.1 * scale
+
+
 def test_a_thin_cloud_gets_random_points_at_its_depths(generator):
     cameras = [looking(at, (0.0, 0.0, 10.0)) for at in ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))]
     flat = torch.rand(999, 3, generator=generator) + torch.tensor([0.0, 0.0, 8.0])
