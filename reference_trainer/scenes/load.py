@@ -59,7 +59,8 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
 
     Raises:
         FileNotFoundError: if a file or folder is missing.
-        ValueError: if an option or a file is invalid, or the points have seen test views.
+        ValueError: if an option or a file is invalid, the points have seen test views, or the world's origin is too far
+            from the cameras for float32.
 
     Example:
         >>> scene = load_scene(SceneOptions("synthetic", downscale=4))
@@ -71,6 +72,7 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
     root = Path(options.path)
     capture = find_reader(root, options.format)(root, options)
     train, test = _split(root, capture, options)
+    _check_origin([*train, *test])
     trained = [frame.name for frame in train]
     # Initial points must come from no photograph that is not trained on, whether it is tested or not.
     held_out = {frame.name for frame in [*capture.frames, *(capture.test or [])]} - set(trained)
@@ -182,6 +184,18 @@ def _split(root: Path, capture: Capture, options: SceneOptions) -> tuple[list[Fr
             f"{root} has no split {split!r}; choose auto, {', '.join(RULES)} or a JSON file of the scene: {found}."
         )
     return [frames[i] for i in train_ids], [frames[i] for i in test_ids]
+
+
+def _check_origin(frames: list[Frame]) -> None:
+    """Refuse cameras so far from the world's origin that float32 blurs their places, as in coordinates of a map."""
+    centers = torch.stack([frame.camera.position.double() for frame in frames])
+    far, apart = centers.norm(dim=1).max().item(), (centers - centers.mean(0)).norm(dim=1).max().item()
+    if 1e-9 * far < apart < 1e-4 * far:  # below that all stand in one place
+        raise ValueError(
+            f"the cameras are {far:,.0f} from the origin of the world and {apart:,.3g} from their middle, which single "
+            "precision cannot tell well enough: move the origin to them, of points too (pycolmap's "
+            "Reconstruction.normalize does)."
+        )
 
 
 def _downscale(frames: list[Frame], asked: float | None) -> tuple[float, str]:

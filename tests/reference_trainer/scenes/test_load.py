@@ -49,6 +49,15 @@ def test_photographs_without_a_camera_are_named_also_in_folders_of_their_cameras
     assert "not used: new.png" in str(load_scene(options))
 
 
+def test_cameras_in_coordinates_of_a_map_are_refused(photo_scene):
+    """In single precision some would share a place: 5,000 kilometers in meters are known to half a meter."""
+    names = ("a b.png", "b.png", "c.png")
+    lines = [f"{i} 1 0 0 0 {-5e6 - i / 4} 0 4 {7 - 6 * (i > 0)} {name}\n\n" for i, name in enumerate(names)]
+    (photo_scene / "sparse/0/images.txt").write_text("".join(lines))
+    with pytest.raises(ValueError, match="from the origin"):
+        load_scene(SceneOptions(photo_scene, points="random:5"))
+
+
 def test_colmap_scene(photo_scene):
     scene = load_scene(SceneOptions(photo_scene, points="sparse/0", undistort=False))
     assert "is left in" in str(scene)
