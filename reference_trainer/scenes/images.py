@@ -209,19 +209,19 @@ def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def path_inside(root: str | Path, relative: str) -> Path:
-    """Return ``root / relative`` for a path that comes from a file and must not lead out of ``root``.
+    """Return ``root / relative`` for a path that comes from a file, relative or not, and must not lead out of ``root``.
 
     Symbolic links are not resolved: a data set may link to pictures elsewhere, but must not name them.
 
     Raises:
-        ValueError: if the path is absolute or leaves ``root``.
+        ValueError: if the path leaves ``root``.
 
     Example:
         >>> path_inside("scene", "./train/r_2").as_posix()
         'scene/train/r_2'
     """
-    normal = os.path.normpath(relative)
-    if os.path.isabs(relative) or normal.split(os.sep)[0] == os.pardir:
+    normal = os.path.relpath(os.path.join(root, relative), root)
+    if normal.split(os.sep)[0] == os.pardir:
         raise ValueError(f"the path {relative!r} leads out of the scene folder {root}; it must stay inside.")
     return Path(root) / normal
 

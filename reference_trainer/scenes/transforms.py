@@ -21,6 +21,8 @@ from reference_trainer.scenes.scene import PointCloud
 
 __all__ = ["BLENDER", "TRANSFORMS", "read_transforms"]
 
+_OPENCV = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")  # models that are parts of its model
+
 
 def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
     """Read the frames of one ``transforms*.json``, in the order of the file.
@@ -30,10 +32,10 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
     COLMAP files it came from. The focal length is ``fl_x`` and ``fl_y``, pixels, for a picture of ``w`` x ``h``, or
     without these for that of ``file_path``; else it follows from the horizontal field of view ``camera_angle_x``,
     radians. The principal point ``cx``, ``cy`` is the center of the picture unless given; ``k1 k2 p1 p2 k3`` are
-    OpenCV's distortion. A frame may override each of these. ``file_path`` is relative to the JSON file; without an
-    extension it means a PNG file. With ``images``, pictures of the same names are taken from that folder beside the
-    file. ``mask_path`` is that of a mask, white where the picture counts. Frames are named by the relative path of
-    their picture, without extension.
+    OpenCV's distortion. A frame may override each of these. ``file_path`` is relative to the JSON file or absolute;
+    without an extension it means a PNG file, or else another picture of that name. With ``images``, pictures of the
+    same names are taken from that folder beside the file. ``mask_path`` is that of a mask, white where the picture
+    counts. Frames are named by the relative path of their picture, without extension.
 
     Raises:
         FileNotFoundError: if the file or images are missing.
@@ -46,8 +48,8 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
     try:
         content = read_json(path)
         entries = content["frames"]
-        if not isinstance(entries, list):
-            raise TypeError(f"frames must be a list, got a {type(entries).__name__}")
+        if not isinstance(entries, list) or not entries:
+            raise TypeError(f"frames must be a list of at least one, got {entries!r:.80}")
         files = [_file(path.parent, entry["file_path"], images) for entry in entries]
         missing = [str(file) for file in files if not file.is_file()]
         if missing:
@@ -71,7 +73,10 @@ def _file(root: Path, file_path: str, images: str | None) -> Path:
         raise ValueError(f"file_path {file_path!r} names the scene folder itself, not an image.")
     if images is not None:
         file = root / images / file.name
-    return file if file.suffix.lower() in IMAGE_SUFFIXES else file.with_name(file.name + ".png")
+    if file.suffix.lower() in IMAGE_SUFFIXES:
+        return file
+    named = [file.with_name(file.name + suffix) for suffix in (".png", *sorted(IMAGE_SUFFIXES))]
+    return next((path for path in named if path.is_file()), named[0])
 
 
 def _inside(root: Path, name: str) -> Path:
@@ -104,7 +109,7 @@ def _frame(path: Path, file: Path, entry: dict[str, Any], back: NDArray[np.float
     if not all(map(math.isfinite, intrinsics)):
         raise ValueError(f"focal lengths, principal point and distortion must be finite, got {intrinsics}.")
     model = str(entry.get("camera_model", "OPENCV"))
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE") or entry.get("is_fisheye") or entry.get("k4"):
+    if model not in _OPENCV or entry.get("is_fisheye") or entry.get("k4"):
         raise ValueError(f"its camera {model} is no lens of OpenCV's model with k1 k2 p1 p2 k3: undistort it first")
     name = file.relative_to(path.parent).with_suffix("").as_posix()
     mask = _inside(path.parent, entry["mask_path"]) if entry.get("mask_path") else None
@@ -162,8 +167,9 @@ def _read_transforms(root: Path, options: SceneOptions) -> Capture:
 def _read_blender(root: Path, options: SceneOptions) -> Capture:
     """Read a scene of a training and a test file."""
     only_default("blender", images=options.images, split=options.split)
-    train, test = (read_transforms(root / f"transforms_{kind}.json") for kind in ("train", "test"))
-    return Capture(train, test, views=8, background="white")
+    train, test = (root / f"transforms_{kind}.json" for kind in ("train", "test"))
+    held_out = None if options.test == "none" and not test.is_file() else read_transforms(test)
+    return Capture(read_transforms(train), held_out, views=8, background="white")
 
 
 BLENDER = SceneFormat(

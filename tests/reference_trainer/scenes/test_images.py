@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -157,3 +159,4 @@ def test_paths_out_of_the_scene_are_refused(path):
 def test_paths_within_the_scene_are_kept():
     assert path_inside("scene", "a/../b.png").as_posix() == "scene/b.png"
     assert path_inside("scene", "..b.png").as_posix() == "scene/..b.png"
+    assert path_inside("scene", str(Path("scene/a.png").absolute())).as_posix() == "scene/a.png"

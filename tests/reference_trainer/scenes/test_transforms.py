@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from reference_trainer.scenes import SceneOptions, load_scene
 from reference_trainer.scenes.colmap import colmap_frames, read_colmap
 from reference_trainer.scenes.frames import load_view
 from reference_trainer.scenes.transforms import read_transforms
@@ -83,9 +85,38 @@ def test_paths_may_have_been_written_on_windows(blender_scene):
     assert [(frame.name, frame.path) for frame in found] == [(frame.name, frame.path) for frame in expected]
 
 
+def test_paths_may_be_absolute_and_without_the_extension_of_a_jpeg(blender_scene):
+    path = blender_scene / "transforms_train.json"
+    pictures = blender_scene / "train"
+    (pictures / "r_1.png").rename(pictures / "r_1.JPG")
+    (pictures / "r_2.png").rename(pictures / "r_2.jpg")
+    rewrite(path, lambda c: c["frames"][0].update(file_path=str(pictures / "r_0")))
+    rewrite(path, lambda c: c["frames"][1].update(file_path="train/r_1.JPG", mask_path=str(pictures / "r_0.png")))
+    frames = read_transforms(path)
+    assert [frame.path.name for frame in frames] == ["r_0.png", "r_1.JPG", "r_2.jpg"]
+    assert [frame.name for frame in frames] == ["train/r_0", "train/r_1", "train/r_2"]
+    assert frames[1].mask == pictures / "r_0.png"
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "RADIAL", "OPENCV"])
+def test_radial_models_are_opencvs(blender_scene, model):
+    path = blender_scene / "transforms_train.json"
+    rewrite(path, lambda c: c.update(camera_model=model, k1=0.05))
+    assert read_transforms(path)[0].distortion == (0.05, 0, 0, 0, 0)
+
+
+def test_without_test_views_no_file_of_them_is_needed(blender_scene):
+    (blender_scene / "transforms_test.json").unlink()
+    options = SceneOptions(str(blender_scene), points="random:5", test="none")
+    assert len(load_scene(options).train) == 3
+    with pytest.raises(FileNotFoundError, match=r"transforms_test\.json"):
+        load_scene(replace(options, test="auto"))
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
+        (lambda c: c.update(frames=[]), "frames must be"),
         (lambda c: c.pop("frames"), "no entry 'frames'"),
         (lambda c: c.pop("camera_angle_x"), "no entry 'camera_angle_x'"),
         (lambda c: c.update(camera_angle_x=math.pi), "camera_angle_x must be"),
