@@ -35,6 +35,9 @@ class Capture:
         views: the default number of training views.
         background: ``"black"`` or ``"white"``, behind transparent pictures.
         note: what a user should know.
+
+    Raises:
+        ValueError: if there are no frames.
     """
 
     frames: list[Frame]
@@ -44,6 +47,10 @@ class Capture:
     views: int = 3
     background: str = "black"
     note: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.frames:
+            raise ValueError("the scene has no photograph with a camera: its file of cameras lists none.")
 
 
 Reader = Callable[[Path, SceneOptions], Capture]

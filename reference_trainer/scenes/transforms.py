@@ -48,8 +48,8 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
     try:
         content = read_json(path)
         entries = content["frames"]
-        if not isinstance(entries, list) or not entries:
-            raise TypeError(f"frames must be a list of at least one, got {entries!r:.80}")
+        if not isinstance(entries, list):
+            raise TypeError(f"frames must be a list, got a {type(entries).__name__}")
         files = [_file(path.parent, entry["file_path"], images) for entry in entries]
         missing = [str(file) for file in files if not file.is_file()]
         if missing:
