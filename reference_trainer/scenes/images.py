@@ -26,6 +26,7 @@ __all__ = [
     "path_inside",
     "photograph_folder",
     "read_image",
+    "reduction",
     "resize_image",
     "unreadable_photographs",
 ]  # fmt: skip
@@ -226,6 +227,17 @@ def path_inside(root: str | Path, relative: str) -> Path:
     return Path(root) / normal
 
 
+def reduction(folder: Path, usual: str = "images") -> int:
+    """Return by how much the copies in a folder ``<usual>_<factor>`` are reduced; 0 for one of another name.
+
+    Example:
+        >>> reduction(Path("garden/images_4")), reduction(Path("garden/images"))
+        (4, 0)
+    """
+    name, _, factor = folder.name.rpartition("_")
+    return int(factor) if name == usual and factor.isdecimal() else 0
+
+
 def image_folder(root: Path, name: str | None, usual: str = "images") -> Path:
     """Return the folder of a scene's photographs: the named one, or a default.
 
@@ -239,10 +251,9 @@ def image_folder(root: Path, name: str | None, usual: str = "images") -> Path:
     if name is not None:
         found = [root / name] if (root / name).is_dir() else []
     else:
-        factors = {path: path.name.removeprefix(f"{usual}_") for path in root.glob(f"{usual}_*") if path.is_dir()}
-        reduced = [path for path, factor in factors.items() if factor.isdecimal()]
         found = [root / usual] if (root / usual).is_dir() else []
-        found += sorted(reduced, key=lambda path: int(factors[path]))
+        by_factor = sorted((reduction(path, usual), path) for path in root.iterdir() if path.is_dir())
+        found += [path for factor, path in by_factor if factor]
         first, found = found[:1], [path for path in found if any(map(is_image, path.iterdir()))]
         found = found or ([root] if any(map(is_image, root.iterdir())) else first)
     if not found:

@@ -23,6 +23,7 @@ from reference_trainer.scenes.images import (
     has_alpha,
     opened_image,
     photograph_folder,
+    reduction,
 )
 
 __all__ = ["collect_photographs", "is_video", "sharpest_frames", "sort_photographs", "unread_folders"]
@@ -99,8 +100,8 @@ def sort_photographs(source: Path) -> tuple[list[Path], dict[str, str]]:
 def unread_folders(source: Path, own: Path) -> dict[str, str]:
     """Return what to do about photographs, down to two levels, that `sort_photographs` does not read, by folder.
 
-    Only their owner knows which are of one place. What lies in ``own``, the folder of a run, or is called masks, is no
-    photograph.
+    Only their owner knows which are of one place. What lies in ``own``, the folder of a run, is called masks or holds
+    reduced copies of those that are read, is no photograph.
     """
     read = photograph_folder(source, _KINDS)
     found = (path for pattern in ("*", "*/*", "*/*/*") for path in source.glob(pattern) if path.parent != read)
@@ -112,6 +113,7 @@ def unread_folders(source: Path, own: Path) -> dict[str, str]:
         and path.is_file()
         and not path.resolve().is_relative_to(own.resolve())
         and path.parent.name.lower() not in ("mask", "masks")
+        and not reduction(path.parent, read.name)
     )
     return {
         str(folder): f"{number} photographs or videos in {folder} are not read: move them to {read}"

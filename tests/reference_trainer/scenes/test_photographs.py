@@ -171,7 +171,11 @@ def test_a_folder_images_counts_only_if_pictures_are_there(tmp_path):
     assert not unread_folders(tmp_path, tmp_path / "out")
     inside = saved(tmp_path / "images" / "b.jpg", picture())
     assert sort_photographs(tmp_path)[0] == [inside]
-    assert f"move them to {inside.parent}" in unread_folders(tmp_path, tmp_path / "out")[str(tmp_path)]
+    (tmp_path / "images_2").mkdir()
+    saved(tmp_path / "images_2" / "b.jpg", picture())
+    (said,) = unread_folders(tmp_path, tmp_path / "out").values()
+    assert said.startswith("1 ")
+    assert f"in {tmp_path} are not read: move them to {inside.parent}" in said
 
 
 def test_transparency_stays(tmp_path):
