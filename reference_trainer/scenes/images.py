@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 import torch
@@ -193,7 +194,9 @@ def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
     if folder.is_dir() and all(path.is_file() for path in paths.values()):
         return paths
     files = list_images(folder)
-    by_stem, stems = {file.stem: file for file in files}, {name: Path(name).stem for name in names}
+    # A Mac takes the accents of names apart.
+    by_stem = {normalize("NFC", file.stem): file for file in files}
+    stems = {name: normalize("NFC", Path(name).stem) for name in names}
     unique = len(by_stem) == len(files) and len(set(stems.values())) == len(names)  # not so for two folders of cameras
     if unique and by_stem.keys() >= set(stems.values()):
         return {name: by_stem[stem] for name, stem in stems.items()}
@@ -201,7 +204,7 @@ def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
     if len(files) == len(names) and not common:
         return dict(zip(sorted(names), files, strict=True))
     missing = [name for name in names if not paths[name].is_file() and stems[name] not in common]
-    others = [file.name for file in files if file.stem not in common]
+    others = [file.name for stem, file in by_stem.items() if stem not in common]
     raise ValueError(
         f"{folder} lacks {len(missing)} of the {len(names)} images of the scene, such as {missing[:3]}; it holds "
         f"{len(files)} files, such as {(others or [file.name for file in files])[:3]}. Choose another image folder; "

@@ -108,6 +108,13 @@ def test_match_images_by_name_stem_and_order(tmp_path):
         match_images(tmp_path / "a", ["IMG_1.JPG", "IMG_2.JPG"])
 
 
+def test_a_name_is_the_same_with_its_accents_apart(tmp_path):
+    """As a Mac writes it; the cameras were found elsewhere."""
+    touch(tmp_path / "a", "Tu\N{COMBINING DIAERESIS}r.jpg", "z.jpg")
+    found = match_images(tmp_path / "a", ["T\N{LATIN SMALL LETTER U WITH DIAERESIS}r.jpg", "z.jpg"])
+    assert [path.name[0] for path in found.values()] == ["T", "z"]
+
+
 def test_a_renamed_photograph_is_not_paired_with_another_camera(tmp_path):
     """By order all three would be."""
     touch(tmp_path / "a", "IMG_4.JPG", "IMG_6.JPG", "portal.JPG")
