@@ -31,7 +31,7 @@ class Frame:
         camera: its camera, at the picture size that the scene file refers to; the pose is float64.
         distortion: coefficients of the lens, in the order of `reference_trainer.scenes.frames.distort`.
         bounds: nearest and farthest depth of the scene in this view, if the scene file has them.
-        mask: a picture that is white on the object, if the scene has one.
+        mask: a picture that is white on the object, or 1 where 0 is elsewhere, if the scene has one.
     """
 
     name: str
@@ -102,8 +102,9 @@ def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0, undis
     layers = {"image": image if alpha is None else composite(image, alpha, background)}
     layers |= {} if alpha is None else {"alpha": alpha[None]}
     if frame.mask is not None:
-        layers["mask"] = read_image(frame.mask)[0].mean(0, keepdim=True)
-        check_shape(frame.mask, layers["mask"], frame, frame.camera.resized(width, height))
+        mask = read_image(frame.mask)[0].mean(0, keepdim=True)
+        layers["mask"] = 255 * mask if mask.max() < 1.5 / 255 else mask  # of zeros and ones: white is 1
+        check_shape(frame.mask, mask, frame, frame.camera.resized(width, height))
     camera = frame.camera.resized(max(1, round(width / downscale)), max(1, round(height / downscale)))
     fits = {name: fitted(layer, camera, frame.distortion if undistort else ()) for name, layer in layers.items()}
     image, camera = fits.pop("image")

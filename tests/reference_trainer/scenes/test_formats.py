@@ -214,11 +214,12 @@ def test_masks_of_nerfstudio(nerfstudio, save_image):
     _change(path, frames=content["frames"])
     with pytest.raises(FileNotFoundError, match=r"masks/c\.png"):
         load_scene(SceneOptions(nerfstudio))
-    save_image(nerfstudio / "masks" / "c.png", np.repeat(np.uint8([[255, 0]]), 32, axis=1).repeat(48, axis=0))
-    scene = load_scene(SceneOptions(nerfstudio, undistort=False))
-    assert [view.mask is None for view in scene.train] == [True, True, False]
-    assert scene.train[2].mask.equal((torch.arange(64) < 32).float().expand(48, 64))
-    assert "what is white" in str(scene)
+    for white in (1, 255):
+        save_image(nerfstudio / "masks" / "c.png", np.repeat(np.uint8([[white, 0]]), 32, axis=1).repeat(48, axis=0))
+        scene = load_scene(SceneOptions(nerfstudio, undistort=False), trains=False)
+        assert [view.mask is None for view in scene.train] == [True, True, False]
+        assert scene.train[2].mask.equal((torch.arange(64) < 32).float().expand(48, 64))
+        assert "what is white" in str(scene)
     save_image(nerfstudio / "masks" / "c.png", np.zeros((48, 48), np.uint8))  # of another crop
     with pytest.raises(ValueError, match=r"c\.png is 48x48, .*64x48"):
         load_scene(SceneOptions(nerfstudio, undistort=False))
