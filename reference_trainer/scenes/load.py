@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.json_files import read_json
+from reference_trainer.render.constants import NEAR_PLANE
 from reference_trainer.scenes.colmap import COLMAP
 from reference_trainer.scenes.dense import THIN, dense_start, made_unasked
 from reference_trainer.scenes.depth import point_prior, true_priors, with_prior
@@ -59,8 +60,8 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
 
     Raises:
         FileNotFoundError: if a file or folder is missing.
-        ValueError: if an option or a file is invalid, the points have seen test views, or the world's origin is too far
-            from the cameras for float32.
+        ValueError: if an option or a file is invalid, the points have seen test views, the world's origin is too far
+            from the cameras for float32, or most of what they see is before the near plane.
 
     Example:
         >>> scene = load_scene(SceneOptions("synthetic", downscale=4))
@@ -95,6 +96,7 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
         cloud, about_points = dense_start(views["train"], cloud)
     elif options.points == "auto" and start is None:
         cloud, about_points = _enough_points(cloud, about_points, views["train"], train, generator)
+    about_near = _about_near(views["train"], cloud) if trains else ""
     about_exposure = ""
     if options.one_exposure:
         *of_splits, about_exposure = with_one_exposure(views["train"], views["test"], cloud.positions)
@@ -111,6 +113,7 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
     folders = sorted({frame.path.parent for frame in capture.frames})
     unread = [name for folder in folders for name in unreadable_photographs(folder)]
     about_unread = f"not read: {', '.join(unread)}. Save them as JPEG or PNG, and find their cameras" * bool(unread)
+    notes = about_unread, capture.note, about_size, about_lenses, about_masks, about_points, about_near, about_exposure
     return Scene(
         name=root.resolve().name,
         **views,
@@ -118,11 +121,7 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
         start=start,
         background=color,
         source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
-        notes=tuple(
-            filter(
-                None, (about_unread, capture.note, about_size, about_lenses, about_masks, about_points, about_exposure)
-            )
-        ),
+        notes=tuple(filter(None, notes)),
     )
 
 
@@ -196,6 +195,20 @@ def _check_origin(frames: list[Frame]) -> None:
             "precision cannot tell well enough: move the origin to them, of points too (pycolmap's "
             "Reconstruction.normalize does)."
         )
+
+
+def _about_near(views: Sequence[View], cloud: PointCloud) -> str:
+    """Return a note on points before the near plane, empty if they are few; refuse a world in which most are."""
+    seen = [(*view.camera.project(cloud.positions), view.camera) for view in views]
+    depths = torch.cat([depth[camera.inside(pixels, depth)] for pixels, depth, camera in seen])
+    share = float((depths < NEAR_PLANE).float().mean()) if len(depths) else 0.0
+    about = (
+        f"{share:.0%} of the initial points that the cameras see are nearer than {NEAR_PLANE} units, where nothing is "
+        "rendered: make the world larger, cameras and points (pycolmap's Reconstruction.normalize does)"
+    )
+    if share > 0.5:
+        raise ValueError(f"{about}.")
+    return about * (share > 0.01)
 
 
 def _downscale(frames: list[Frame], asked: float | None) -> tuple[float, str]:

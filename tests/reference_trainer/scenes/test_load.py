@@ -58,6 +58,23 @@ def test_cameras_in_coordinates_of_a_map_are_refused(photo_scene):
         load_scene(SceneOptions(photo_scene, points="random:5"))
 
 
+@pytest.mark.parametrize(("scale", "share"), [(1.0, 0), (0.06, 0.25), (0.01, 1)])
+def test_a_world_before_the_near_plane_is_named(photo_scene, scale, share):
+    """Nothing nearer than 0.2 is rendered; a quarter of these points lie at 3, the others at 4 times the scale."""
+    names = ("a b.png", "b.png", "c.png")
+    lines = [f"{i} 1 0 0 0 {-scale * i / 4} 0 {4 * scale} 1 {name}\n\n" for i, name in enumerate(names)]
+    points = [f"{i} {i * scale / 9} 0 {-scale * (i == 0)} 9 9 9 0.1 0 0 1 0 2 0\n" for i in range(4)]
+    (photo_scene / "sparse/0/images.txt").write_text("".join(lines))
+    (photo_scene / "sparse/0/points3D.txt").write_text("".join(points))
+    options = SceneOptions(photo_scene, points="sparse/0", test="none")
+    if share > 0.5:
+        with pytest.raises(ValueError, match="100% of the"):
+            load_scene(options)
+        load_scene(options, trains=False)
+    else:
+        assert ("25% of the" in str(load_scene(options))) == (share > 0)
+
+
 def test_colmap_scene(photo_scene):
     scene = load_scene(SceneOptions(photo_scene, points="sparse/0", undistort=False))
     assert "is left in" in str(scene)
