@@ -189,8 +189,8 @@ def _check_origin(frames: list[Frame]) -> None:
     """Refuse cameras so far from the world's origin that float32 blurs their places, as in coordinates of a map."""
     centers = torch.stack([frame.camera.position.double() for frame in frames])
     far, apart = centers.norm(dim=1).max().item(), (centers - centers.mean(0)).norm(dim=1).max().item()
-    # Below the first all stand in one place. At the second a center is off by 0.1 pixels or so, at a focal length of 300
-    # pixels and a depth of five times the distance between the cameras.
+    # Below the first all stand in one place. At the second a center is off by some 0.1 pixels, at a focal length of 300
+    # and a depth of five times the distance between the cameras.
     if 1e-9 * far < apart < 3e-5 * far:
         raise ValueError(
             f"the cameras are {far:,.0f} from the origin of the world and {apart:,.3g} from their middle, which single "

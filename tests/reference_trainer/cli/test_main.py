@@ -285,7 +285,7 @@ def test_a_name_that_the_terminal_cannot_show_stops_nothing(monkeypatch):
     shown = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, encoding="utf-8", errors="strict"))
     with cli.log_shown():
-        print("photo\udcff.jpg")  # not logged: pytest-xdist cannot pass such a record on
+        print("photo\udcff.jpg", flush=True)  # not logged: pytest-xdist cannot pass such a record on
     assert shown.getvalue() == rb"photo\udcff.jpg" + os.linesep.encode()
 
 
