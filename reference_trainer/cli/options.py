@@ -52,11 +52,11 @@ class RenderOptions:
             )
         use_engine(self.engine) if self.engine is not None else chosen_engine()
 
-    def begin(self, device: str, *, trains: bool = False) -> None:
+    def begin(self, device: str, *, trains: bool = False, points: bool = False) -> None:
         """Choose the engine of this process and its workers, and print which it is.
 
-        One that ``trains`` needs all loops: those not compiled yet are then compiled now, with progress. Raises a
-        ValueError for triton on a processor, unless its interpreter is asked for.
+        One that ``trains`` needs all loops but those that measure ``points``: what is not compiled yet is compiled now,
+        with progress. Raises a ValueError for triton on a processor, unless its interpreter is asked for.
         """
         import torch
 
@@ -68,7 +68,7 @@ class RenderOptions:
         if trains and device == "cpu":
             from reference_trainer.runs.warmup import warm_up
 
-            warm_up()
+            warm_up(points=points)
 
 
 Rendering = Annotated[RenderOptions, tyro.conf.arg(name="rendering")]

@@ -143,7 +143,7 @@ class Run:
 
         self.rendering.choose(self.device)
         scene = self._photographs()
-        self.rendering.begin(self.device, trains=True)
+        self.rendering.begin(self.device, trains=True, points=True)
         options, config = self._settings(scene)
         if self.again not in (None, "photographs"):  # only now: what is refused is refused with everything in place
             with run.run_lock(self.folder):

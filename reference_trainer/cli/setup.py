@@ -107,7 +107,7 @@ class Warmup:
 
         # Only the CPU has loops that can be compiled ahead, whatever card there is.
         self.rendering.begin("cpu")
-        names = warm_up()
+        names = warm_up(points=True)
         print(f"Compiled: {', '.join(names)}." if names else "Nothing is left to compile.")
 
 

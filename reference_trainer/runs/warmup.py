@@ -29,11 +29,11 @@ _UNTIMED, _TIMED = 3, 9  # steps
 
 
 @functools.cache
-def warm_up() -> tuple[str, ...]:
+def warm_up(*, points: bool = False) -> tuple[str, ...]:
     """Use every loop once per process, if the CPU engine is the loops; return the names of those that were compiled.
 
-    A training step of each kind, a score of each kind and a dense start compile exactly the variants of the loops that
-    are needed; those in the disk cache are loaded from it.
+    A training step of each kind and a score of each kind compile exactly the variants of the loops that are needed, and
+    with ``points`` a dense start does; those in the disk cache are loaded from it.
     """
     if describe_engine("cpu") == "torch":
         return ()
@@ -52,7 +52,7 @@ def warm_up() -> tuple[str, ...]:
             bar.update()
 
         with reported_to(note):
-            _use_everything()
+            _use_everything(points)
     return tuple(names)
 
 
@@ -75,11 +75,12 @@ def step_seconds(width: int, height: int, device: str = "cpu") -> float:
     return (time.perf_counter() - begun) / _TIMED
 
 
-def _use_everything() -> None:
+def _use_everything(points: bool) -> None:
     """Measure points, take one training step of each kind and compute each score on a scene of a few pixels."""
     scene = synthetic_scene(width=8, height=6, points=20)
-    with suppress(ValueError):  # so few pixels give too few points
-        dense_points(scene.train)
+    if points:
+        with suppress(ValueError):  # so few pixels give too few
+            dense_points(scene.train)
     plain = TrainConfig(iterations=1, dropout=0.2)
     kinds = {"analytic": True}, {"density": "absgrad"}, {"loss": "photometric + smooth_depth(0.001)"}
     for config in (plain, *(replace(plain, **kind) for kind in kinds)):

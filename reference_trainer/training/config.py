@@ -39,7 +39,7 @@ class TrainConfig:
     analytic: bool = False
     """Train on the expectation over the regularizers, computed exactly, instead of one random draw."""
     regularize_from: int = 0
-    """Number of steps before the regularizers begin; less than ``iterations`` if there are any."""
+    """Number of steps before the regularizers begin; fewer than all if there are any."""
     loss: str = "photometric"
     """Terms of the loss, such as "photometric(0.2) + co_adaptation(3.0)", or "my_module:MyTerm"."""
     density: str = "adaptive"
@@ -47,7 +47,7 @@ class TrainConfig:
     them."""
     guard: int = 0
     """Steps between removals of Gaussians that hang where nobody took a photograph, the last one after the last step;
-    as many as ``iterations``: that alone; 0 never. Only models with a regularizer are guarded, of two views or more."""
+    all steps: that alone; 0 never. Only models with a regularizer are guarded, of two views or more."""
     models: int = 1
     """Models that are trained side by side and compared with each other, 2 for CoR-GS and SE-GS; the first is kept."""
     random_background: Literal["off", "auto", "on"] = "off"
@@ -108,9 +108,9 @@ class TrainConfig:
     opacity_reset_every: int = 3_000
     """Steps between resets; 0 never resets."""
     opacity_reset_over_white: bool = False
-    """Over a white background, opacities are reset at step ``densify_from`` as well."""
+    """Over a white background, opacities are reset when density control begins as well."""
     opacity_decay: float = 1.0
-    """Opacities are multiplied by this at every step after ``densify_from``; 1 does nothing."""
+    """Opacities are multiplied by this at every step from the beginning of density control on; 1 does nothing."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):

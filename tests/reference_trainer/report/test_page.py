@@ -23,7 +23,7 @@ from reference_trainer.report import page as page_module
 from reference_trainer.report.findings import find, pictures_of
 from reference_trainer.report.packing import quantized
 from reference_trainer.report.page import compare_two, write_report
-from reference_trainer.runs.folder import CONFIG, run_settings
+from reference_trainer.runs.folder import CHECKPOINT, CONFIG, run_settings
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig
@@ -334,9 +334,12 @@ def test_the_scores_of_a_comparison_are_those_of_all_its_seeds(run, tmp_path):
             folder = tmp_path / name / f"seed_{seed}"
             shutil.copytree(run[0], folder)
             changed = {"seed": seed, "dropout": dropout, "noise": noise}
-            write_json(folder / CONFIG, settings | {"config": settings["config"] | changed})
+            config = settings["config"] | changed
+            write_json(folder / CONFIG, settings | {"config": config})
+            state = torch.load(folder / CHECKPOINT, weights_only=True)
+            torch.save(state | {"config": json.dumps(config)}, folder / CHECKPOINT)
             means = results["mean"] | {"test": results["mean"]["test"] | {"psnr": value}}
-            write_json(folder / "results.json", results | {"config": results["config"] | changed, "mean": means})
+            write_json(folder / "results.json", results | {"config": config, "mean": means})
     data = Parsed(write_report([tmp_path], views=1)).data
     assert [each["label"] for each in data["runs"]] == ["Baseline", "Dropout 0.2"]
     assert [(of["name"], of["seeds"]) for of in data["strategies"]] == [("Baseline", 2), ("Dropout 0.2", 2)]
