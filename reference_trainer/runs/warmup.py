@@ -76,7 +76,7 @@ def step_seconds(width: int, height: int, device: str = "cpu") -> float:
 
 
 def _use_everything(points: bool) -> None:
-    """Measure points, take one training step of each kind and compute each score on a scene of a few pixels."""
+    """Take a training step of each kind and compute each score on a scene of a few pixels; ``points``: measure some."""
     scene = synthetic_scene(width=8, height=6, points=20)
     if points:
         with suppress(ValueError):  # so few pixels give too few

@@ -1,12 +1,21 @@
-"""A scene with masks, for what measures quality."""
+"""A finished run, and a scene with masks for what measures quality."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
 
+from reference_trainer.runs.run import Monitoring, run_experiment
 from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.options import SceneOptions
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, options, short) -> tuple[Path, dict]:
+    """The folder of a run, which must be copied before it is changed, and its results."""
+    out = tmp_path_factory.mktemp("run")
+    return out, run_experiment(options, short, out, monitoring=Monitoring(3, pictures=True, checkpoint_every=4))
 
 
 @pytest.fixture

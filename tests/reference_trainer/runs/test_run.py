@@ -38,12 +38,6 @@ DAMAGED = ("[]", '{"mean": {}}', *(json.dumps(WHOLE | change) for change in (
 )))  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory, options, short) -> tuple[Path, dict]:
-    out = tmp_path_factory.mktemp("run")
-    return out, run_experiment(options, short, out, monitoring=Monitoring(3, pictures=True, checkpoint_every=4))
-
-
 @pytest.fixture
 def interrupted(finished, options, short, monkeypatch, tmp_path):
     """Start a run that is interrupted in the given function at its given call, then continue it."""
@@ -316,42 +310,6 @@ def test_a_folder_of_somebody_elses_is_not_written_to(name, options, short, tmp_
 def test_the_folder_of_the_scene_is_not_written_to(short, tmp_path):
     with pytest.raises(ValueError, match="folder of the scene"):
         run_experiment(SceneOptions(str(tmp_path)), short, tmp_path)
-
-
-HIDDEN = {  # all of these are module:Class to Python
-    "letters beyond ASCII": "evilmod.\u00c9(0.2)",
-    "comments": "(dropout(0.1) # '\n+ evilmod.Evil(0.2) # '\n)",
-    "escaped quotes": "dropout('\\'') + evilmod.Evil('\\'')",
-}
-
-
-@pytest.mark.parametrize("place", ["config.json", "checkpoint", "loss", "scene", *HIDDEN])
-def test_a_run_imports_no_code_that_nobody_has_named(place, finished, tmp_path, monkeypatch):
-    """The module would leave a mark if it were imported."""
-    out = tmp_path / "run"
-    shutil.copytree(finished[0], out)
-    mark = tmp_path / "mark"
-    (tmp_path / "evilmod.py").write_text(f"import pathlib; pathlib.Path({str(mark)!r}).touch()\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    claim = json.loads((out / CONFIG).read_text())
-    text = {"loss": "photometric + evilmod:Evil", "scene": "evilmod:evil", **HIDDEN}.get(place, "evilmod:Evil(0.2)")
-    if place == "checkpoint":
-        state = torch.load(out / CHECKPOINT, weights_only=True)
-        state["config"] = json.dumps(json.loads(state["config"]) | {"regularizer": text})
-        torch.save(state, out / CHECKPOINT)
-    else:
-        key = {"loss": "loss", "scene": "format"}.get(place, "regularizer")
-        claim["scene" if place == "scene" else "config"][key] = text
-        (out / CONFIG).write_text(json.dumps(claim))
-    with pytest.raises(ValueError, match=r"evilmod, .*not imported.*--trust evilmod"):
-        load_run(out)
-    assert not mark.exists()
-    if place == "checkpoint":
-        claim["config"]["regularizer"] = text
-        (out / CONFIG).write_text(json.dumps(claim))
-        with pytest.raises(ValueError, match="evilmod:Evil cannot be had"):  # there is no such class, but:
-            load_run(out, trust=["evilmod"])
-        assert mark.exists()
 
 
 def test_another_run_in_the_same_folder_is_refused(finished, options, short):
