@@ -116,7 +116,7 @@ def unread_folders(source: Path, own: Path) -> dict[str, str]:
         and not reduction(path.parent, read.name)
     )
     return {
-        str(folder): f"{number} photographs or videos in {folder} are not read: move them to {read}"
+        str(folder): f"photographs or videos in {folder} are not read ({number}): move them to {read}"
         + ", or give their folder instead" * (folder != source)
         for folder, number in held.items()
     }

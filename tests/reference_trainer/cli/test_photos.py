@@ -369,7 +369,7 @@ def test_equal_photographs_and_other_folders_are_named(stopped, garden, tmp_path
     assert stopped("garden") == ["train_0.png", "train_1.png", "train_2.png"]
     said = capsys.readouterr().err
     assert "left out: train_3.png is the same file as train_0.png" in said
-    assert "left out: 4 photographs or videos in garden/DCIM/100 are not read: move them to garden, or give" in said
+    assert "left out: photographs or videos in garden/DCIM/100 are not read (4): move them to garden, or give" in said
     (tmp_path / "card").mkdir()
     shutil.copytree(garden / "DCIM", tmp_path / "card" / "DCIM")
     said = refused(["run", "card"], capsys)

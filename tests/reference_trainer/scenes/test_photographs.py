@@ -159,7 +159,7 @@ def test_photographs_in_other_folders_are_named(tmp_path):
     assert found.keys() == {str(tmp_path / "DCIM/100"), str(tmp_path / "DCIM/101")}
     said = found[str(tmp_path / "DCIM/100")]
     assert said.startswith(
-        f"2 photographs or videos in {tmp_path / 'DCIM/100'} are not read: move them to {tmp_path}, or"
+        f"photographs or videos in {tmp_path / 'DCIM/100'} are not read (2): move them to {tmp_path}, or"
     )
 
 
@@ -174,7 +174,7 @@ def test_a_folder_images_counts_only_if_pictures_are_there(tmp_path):
     (tmp_path / "images_2").mkdir()
     saved(tmp_path / "images_2" / "b.jpg", picture())
     (said,) = unread_folders(tmp_path, tmp_path / "out").values()
-    assert said.startswith("1 ")
+    assert "(1)" in said
     assert f"in {tmp_path} are not read" in said
 
 
