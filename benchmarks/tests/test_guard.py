@@ -1,9 +1,12 @@
 import json
 from dataclasses import replace
+from pathlib import Path
 
+import pytest
 import torch
 
-from benchmarks.guard import RULES, keeps, main, unexplained
+from benchmarks import guard as measured
+from benchmarks.guard import RULES, keeps, main, table, unexplained
 from reference_trainer.evaluation.shares import guard, unseen_shares
 from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
@@ -62,3 +65,11 @@ def test_what_explains_photographs_stays_whatever_it_risks():
     )
     assert torch.equal(unexplained(model, veiled, shares, 5.0), torch.arange(len(both)) == len(start))
     assert not unexplained(model, walled, shares, 5.0).any()
+
+
+@pytest.mark.parametrize("file", ["guard_by_shares", "guard_unneeded", "guard_worth"])
+def test_the_page_has_the_models_that_a_rule_touches(file):
+    here = Path(measured.__file__).parent
+    page = (here / "guard.md").read_text("utf-8").splitlines()
+    lines = table(json.loads((here / "data" / f"{file}.json").read_text("utf-8"))).splitlines()
+    assert [line for line in lines if line not in page and not line.endswith(" (0) |")] == []
