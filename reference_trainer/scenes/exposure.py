@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 from reference_trainer.camera import Camera
 from reference_trainer.scenes.scene import View
 
-__all__ = ["exposure_between", "exposures", "like_training", "with_one_exposure"]
+__all__ = ["difference", "exposure_between", "exposures", "like_training", "with_one_exposure"]
 
 _CELL = 8  # pixels: of points in one cell of a picture the nearest hide the others
 _NEAR = 1.03  # points up to so many times as far as the nearest of their cell are seen
@@ -31,11 +31,10 @@ def with_one_exposure(
     `like_training`. Where the photographs do not differ, or were cut out and stand on a background of one color, the
     views are those that were given.
     """
-    factors = None if any(view.alpha is not None for view in train) else exposures(train, positions)
+    factors = exposures(train, positions)
     if factors is None:
         return tuple(train), tuple(test), ""
-    largest = float((factors.amax(0) / factors.amin(0)).max())
-    note = f"exposures differ by up to {100 * (largest - 1):.0f} %: photographs are made equally bright"
+    note = f"{difference(factors)}: photographs are made equally bright"
     even = tuple(map(_divided, train, factors))
     return even, like_training(test, even), note
 
@@ -59,8 +58,10 @@ def exposures(views: Sequence[View], positions: Tensor) -> Tensor | None:
 
     From the colors of the points (M, 3) that two photographs share: the median of their ratio, for all pairs together
     by least squares. None unless in some pair nine of ten of these points are brighter in the same photograph: less is
-    shading. A photograph that shares hardly any point has the factor 1.
+    shading; and where photographs were cut out. A photograph that shares hardly any point has the factor 1.
     """
+    if any(view.alpha is not None for view in views):
+        return None
     seen = [_colors(view, positions) for view in views]
     rows, ratios, weights, common = [torch.ones(len(views))], [torch.zeros(3)], [0.0], False
     for (i, (a, in_a)), (j, (b, in_b)) in itertools.combinations(enumerate(seen), 2):
@@ -81,6 +82,12 @@ def exposures(views: Sequence[View], positions: Tensor) -> Tensor | None:
     scale = torch.tensor(weights).sqrt()[:, None]
     logarithms: Tensor = torch.linalg.lstsq(scale * torch.stack(rows), scale * torch.stack(ratios), driver="gelsd")[0]
     return logarithms.exp()
+
+
+def difference(factors: Tensor) -> str:
+    """Say by how much the brightest photograph is brighter than the darkest, in the channel where that is most."""
+    largest = float((factors.amax(0) / factors.amin(0)).max())
+    return f"exposures differ by up to {100 * (largest - 1):.0f} %"
 
 
 def exposure_between(camera: Camera, cameras: Sequence[Camera], factors: Tensor) -> Tensor:

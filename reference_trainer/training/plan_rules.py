@@ -10,6 +10,7 @@ from typing import Any, Literal
 import torch
 
 from reference_trainer.scenes.dense import ENOUGH, SOURCE, source_views
+from reference_trainer.scenes.exposure import difference, exposures
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.training.assembly import draws_background, make_density, make_losses, make_regularizer
 from reference_trainer.training.config import TrainConfig
@@ -267,8 +268,22 @@ def dense_start(scene: Scene, config: TrainConfig) -> PlanItem:
     return PlanItem(name, "left out", f"{overlap}: --points dense adds measured points, which gained {gains} dB")
 
 
+def one_exposure(scene: Scene, config: TrainConfig) -> PlanItem:
+    """Photographs made equally bright. It is decided when the scene is loaded: the plan can only tell of them."""
+    name = "one exposure"
+    if any(view.exposure is not None for view in scene.train):
+        return PlanItem(name, "used", "asked for, and photographs differ")
+    factors = exposures(scene.train, scene.points.positions)
+    if factors is None:
+        return PlanItem(name, "left out", "no photograph is brighter than another by more than shading")
+    gains = ", ".join(f"{gain:+.1f} on {scene}" for scene, gain in ONE_EXPOSURE_GAINS.items())
+    return PlanItem(name, "left out", f"{difference(factors)}: --one-exposure undoes that, which gained {gains} dB")
+
+
 DENSE_GAINS = {"fern": 1.9, "herz-jesu": 1.0, "fountain": 0.7, "sceaux": 0.4, "cape": 0.3}
 """What a dense start added to COLMAP's points of the same photographs gained, dB: benchmarks/dense_start.md."""
+ONE_EXPOSURE_GAINS = {"herz-jesu": 0.1, "sceaux": 0.6}
+"""What one exposure gained there, dB, in the mean of six trainings: benchmarks/setting.md."""
 _BUILT_IN = "the built-in scene"
 DROPOUT_GAINS = {
     2: {("fern", 0.2): 1.4, (_BUILT_IN, 0.1): 1.7, (_BUILT_IN, 0.2): 1.7},
@@ -301,6 +316,7 @@ SPARSE_GAINS_FAR_APART = {"DTU scan24": (1.0, 2.4), "DTU scan65": (-1.2, 2.3), "
 RULES: tuple[Callable[[Scene, TrainConfig], PlanItem], ...] = (
     sh_bands, alpha_masks, background, depth_output, distortion, densification, opacity_reset, dropout, dropped,
     guarding, regularizer_inputs, unseen, saturated, ssim_windows, moments, initial_size, dense_start,
+    one_exposure,
 )  # fmt: skip
 """All rules, in the order of the table."""
 

@@ -14,6 +14,8 @@ from reference_trainer.scenes import load_scene
 from reference_trainer.scenes.exposure import exposure_between, exposures, with_one_exposure
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.scenes.synthetic import synthetic_scene
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.plan import make_plan
 
 FACTORS = torch.tensor([[0.8, 0.85, 0.9], [1.0, 1.0, 1.1], [1.2, 1.1, 1.0]])
 
@@ -76,6 +78,16 @@ def test_photographs_become_equally_bright_and_test_photographs_are_not_looked_a
     dark = [replace(view, image=view.image * 0) for view in scene.test]
     for view, unseen in zip(test, with_one_exposure(uneven, dark, scene.points.positions)[1], strict=True):
         assert torch.equal(view.exposure, unseen.exposure)
+
+
+def test_the_plan_tells_where_photographs_differ(scene, uneven):
+    def decided(views):
+        plan = make_plan(replace(scene, train=tuple(views)), TrainConfig())
+        return {item.name: item for item in plan.items}["one exposure"]
+
+    assert "--one-exposure" not in decided(scene.train).reason
+    assert "50 %: --one-exposure" in decided(uneven).reason
+    assert decided(with_one_exposure(uneven, (), scene.points.positions)[0]).decision == "used"
 
 
 def test_what_was_cut_out_keeps_its_background(scene, uneven):
