@@ -40,8 +40,9 @@ from reference_trainer.evaluation.tables import format_mean_std, markdown_table,
 
 __all__ = [
     "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_DEFAULT", "BY_TODAYS", "CHOICES", "DROPOUT_ALONE",
-    "ENSEMBLE", "KINDS", "LEFT_OUT", "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER", "SLOWER_MEANS",
-    "TODAYS_BESIDE_BINOCULAR", "WITHOUT", "Choice", "figures_of", "from_same_start", "gains_of", "pairs_of", "tables",
+    "ENSEMBLE", "EVEN", "EVEN_OVER_PLAIN", "KINDS", "LEFT_OUT", "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER",
+    "SLOWER_MEANS", "TODAYS_BESIDE_BINOCULAR", "UNEVEN", "WITHOUT", "Choice", "figures_of", "from_same_start",
+    "gains_of", "pairs_of", "tables",
 ]  # fmt: skip
 
 
@@ -104,6 +105,7 @@ CHOICES = {
     "twentieth": Choice(("random background",), seeds=(3, 4, 5), tried=(3, 4, 5), begun=from_today),
     "twenty-third": Choice((f"limit 0.2 + {MEAN_BACKGROUND}",), seeds=(2,), tried=(2,), begun=from_today, over=TODAY),
     "twenty-fourth": Choice(_WITHOUT, seeds=(0,), begun=from_today, over=TODAY),
+    "twenty-fifth": Choice((ONE_EXPOSURE,), seeds=range(6), tried=tuple(range(6)), begun=from_today, over=TODAY),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
@@ -117,6 +119,15 @@ BY_DEFAULT = {"plain": "plain", LATER: "recipe"}
 """What the recipe gained from the start that a user has: from the dense start as it was, and as it is now."""
 BY_TODAYS = {"plain": "plain", TODAY: "recipe"}
 """What it gains today."""
+UNEVEN = ("herz-jesu", "sceaux")
+"""The scenes whose photographs differ in exposure."""
+EVEN = tuple(
+    {name: title, f"{name} + {ONE_EXPOSURE}": f"{title}, {ONE_EXPOSURE}"}
+    for name, title in ((TODAY, "recipe"), ("plain", "plain"), (f"{BINOCULAR}{RELATIVE}", BINOCULAR))
+)
+"""What the twenty-fifth choice adds to the recipe, to plain trainings and to Binocular3DGS's."""
+EVEN_OVER_PLAIN = {"plain": "plain", f"{TODAY} + {ONE_EXPOSURE}": f"recipe, {ONE_EXPOSURE}"}
+"""What the recipe would gain with it over plain trainings as they are."""
 
 ENSEMBLE = {"plain": "plain", f"{LATER} + {DISTILLED[2]}": DISTILLED[2]}
 """The judgement of the eleventh choice: the seed is that of the first of two models."""
@@ -168,7 +179,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
     if any(row["candidate"] == next(iter(QUALITY)) for row in rows):
         return [figures_of(rows, QUALITY, "{held-out:.2f} / {psnr:.2f}, {lpips:.3f}, {thousands:.0f}, {seconds:.0f} s")]
     gained = [gains_of(rows, choice) for choice in CHOICES.values()]
-    of_today = (BY_DEFAULT, BY_TODAYS, TODAYS_BESIDE_BINOCULAR, *LEFT_OUT)
+    of_today = (BY_DEFAULT, BY_TODAYS, TODAYS_BESIDE_BINOCULAR, *LEFT_OUT, *EVEN, EVEN_OVER_PLAIN)
     today = [from_same_start(rows, titles, from_today) for titles in of_today]
     without = figures_of(rows, WITHOUT, "{psnr:.2f}, {lpips:.3f}, {score:.2f}, {thousands:.0f}", (0,))
     return [*gained, *(from_same_start(rows, titles) for titles in _JUDGED), *today, without]
@@ -221,15 +232,20 @@ def gains_of(rows: Sequence[Row], choice: Choice) -> str:
 
 
 def _on(scene: str, name: str) -> str:
-    """Return the name that a setting has on a scene: where the photographs show the background, it stays."""
+    """Return the name of a setting's rows of a scene: some make no difference there.
+
+    Where photographs show the background, it stays, and where they do not differ in exposure, they do.
+    """
+    name = name if scene in UNEVEN else name.removesuffix(f" + {ONE_EXPOSURE}")
     return name.replace(TODAY, LATER) if scene in SHOWN else name
 
 
 def _rows(rows: Sequence[Row], scene: str, name: str, begun: Callable[[str], str]) -> dict[int, Row]:
     """Return the rows of a setting with a start, by seed."""
-    if scene == "synthetic":  # which has points of its own, and whose plain trainings are those of the paper's grid
-        return references_of(rows, REFERENCES, scene)["plain"] if name == "plain" else rows_of(rows, scene, name)
-    return rows_of(rows, begun(scene), _on(scene, name))
+    if scene == "synthetic" and name == "plain":  # those of the paper's grid
+        return references_of(rows, REFERENCES, scene)[name]
+    start = scene if scene == "synthetic" else begun(scene)  # it has points of its own
+    return rows_of(rows, start, _on(scene, name))
 
 
 def pairs_of(
@@ -241,6 +257,8 @@ def pairs_of(
     """
     found: dict[str, list[tuple[float, float]]] = {}
     for scene in SCENES:
+        if len({_on(scene, name) for name in names}) == 1:
+            continue
         before, after = (_rows(rows, scene, name, begun) for name in names)
         if shared := sorted(before.keys() & after.keys()):
             found[scene] = [(value(before[seed], "test psnr"), value(after[seed], "test psnr")) for seed in shared]
