@@ -22,8 +22,10 @@ class Chain(Regularizer):
 
     Use it in place of ``nn.Sequential``, which has no :attr:`keep`, :meth:`mask_radii` and :meth:`set_step`, and which
     evaluates the mean of the second member at the mean of the first: the members of a chain contribute their joint
-    mean, in whatever order. A Gaussian is dropped if any member drops it. A module that stands in a chain twice draws
-    twice. Members in ``eval()`` apply their test-time value even in training.
+    mean, in whatever order. The exception is opacity noise behind other noise or a soft mask, whose clamp depends on
+    their draw: there the chain does as ``nn.Sequential``, and has no multiplier. A Gaussian is dropped if any member
+    drops it. A module that stands in a chain twice draws twice. Members in ``eval()`` apply their test-time value even
+    in training.
 
     Args:
         members: regularizers; an ``nn.Sequential`` or another chain is flattened, any other module becomes a
@@ -140,7 +142,7 @@ class Chain(Regularizer):
         return x
 
     def alpha_factor(self, x: Params) -> tuple[Params, Multiplier] | None:
-        """Return the product of the multipliers; None if a member has none."""
+        """Return the product of the multipliers; None if a member has none, or noise stands behind a soft factor."""
         return _alpha_factor(list(self), x)
 
 
@@ -222,13 +224,14 @@ def _combine_draws(draws: Sequence[Draw | None]) -> Draw:
 
 
 def _alpha_factor(members: list[Regularizer], x: Params, *, test: bool = False) -> tuple[Params, Multiplier] | None:
-    """Compose the members' multipliers; None if one has none."""
-    total = Multiplier(1.0, 0.0)
+    """Compose the members' multipliers; None if one has none or depends on the draw of another."""
+    total, soft = Multiplier(1.0, 0.0), False
     for member in members:
         one = member.test_alpha_factor(x) if test else member.alpha_factor(x)
-        if one is None:
+        # The clamp of noise depends on the opacity that it meets, which a soft factor in front makes random.
+        if one is None or (soft and getattr(member, "field", "") == "opacities"):
             return None
-        x, total = one[0], total * one[1]
+        x, total, soft = one[0], total * one[1], soft or not member.drops
     return x, total
 
 

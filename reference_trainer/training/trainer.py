@@ -279,12 +279,12 @@ class Trainer:
         """Raise a ValueError if a regularizer has no exact expectation."""
         with torch.no_grad():
             x = self.gaussians.params(self.views[0].camera)
-            names = [type(member).__name__ for member in self.regularizer if member.alpha_factor(x) is None]
-        if names:
-            raise ValueError(
-                f"analytic training needs draws that are independent factors of the opacities, which those of "
-                f"{', '.join(names)} are not: leave out analytic."
-            )
+            if self.regularizer.alpha_factor(x) is None:
+                names = ", ".join(type(member).__name__ for member in self.regularizer)
+                raise ValueError(
+                    "analytic training needs draws that are independent factors of the opacities, which those of "
+                    f"{names} are not: leave out analytic."
+                )
 
     @property
     def _guards(self) -> bool:

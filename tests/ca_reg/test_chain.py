@@ -8,6 +8,7 @@ from torch import nn
 
 from ca_reg import Chain, Draw, GaussianDropout, IndependentDropout, OpacityNoise, Params, Regularizer
 from ca_reg.regularizers import REGULARIZERS
+from ca_reg.regularizers.concrete import SoftDropout
 
 OPACITY = torch.tensor([0.1, 0.45, 0.8, 0.97], dtype=torch.float64)
 
@@ -136,6 +137,19 @@ def test_a_chain_has_a_multiplier_only_if_every_member_has_one():
     _, multiplier = Chain(GaussianDropout(0.5), ByOpacity()).alpha_factor(Params(OPACITY))
     expected = ByOpacity().alpha_factor(Params(OPACITY))[1]
     torch.testing.assert_close(multiplier.mean, 0.5 * expected.mean)
+
+
+@pytest.mark.parametrize("first", [SoftDropout(), OpacityNoise(0.8, scale=True)], ids=["soft", "noise"])
+def test_noise_behind_a_factor_that_is_not_0_or_1_has_no_multiplier(first):
+    second, opacity = OpacityNoise(0.8, scale=True), torch.tensor([0.6], dtype=torch.float64)
+    chain, many = Chain(first, second), opacity.expand(40_000)
+    torch.manual_seed(0)
+    draws = chain(many)
+    product = opacity * first.alpha_factor(Params(opacity))[1].mean * second.alpha_factor(Params(opacity))[1].mean
+    assert (draws.mean() - product).abs() > 10 * draws.std() / len(draws) ** 0.5  # what the multipliers would say
+    assert chain.alpha_factor(Params(opacity)) is None
+    torch.testing.assert_close(chain.eval()(opacity), second(first(opacity)))
+    assert Chain(OpacityNoise(0.8), SoftDropout()).alpha_factor(Params(opacity)) is not None
 
 
 class Halves(nn.Module):

@@ -81,7 +81,7 @@ def test_it_trains_is_saved_and_resumed_evaluated_and_named_in_the_ply(name, opt
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", list(REGULARIZERS))
+@pytest.mark.parametrize("name", [*REGULARIZERS, "soft + noise(0.8)"])
 def test_it_trains_on_its_expectation_or_says_that_it_has_none(name, options):
     """What it learns included: the expectation has a gradient in it."""
     expression = EXPRESSIONS.get(name, name)
