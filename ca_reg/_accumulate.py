@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from ca_reg._precision import at_least_single
+from ca_reg._precision import at_least_single, without_autocast
 from ca_reg.result import Reason
 from ca_reg.types import ExactMoments
 
@@ -67,7 +67,8 @@ class RenderMoments:
         # Sums over pixels, in float64 beyond single rows: of the squares, and of the products of the groups' sums.
         squares = (self._squares[:used] * visible).sum(-1).double().sum(-1)
         rows = (self._sums[:used] * visible).flatten(1, 2).transpose(0, 1)
-        products = torch.bmm(rows, rows.mT).double().sum(0)
+        with without_autocast(rows.device):
+            products = torch.bmm(rows, rows.mT).double().sum(0)
         # The rest is about a few numbers, each operation a launch on a card: read once, it is left to the processor.
         sums = torch.cat([squares, products.flatten(), visible.sum(dtype=torch.float64)[None]]).cpu()
         squares, products, pixels = sums[:used], sums[used:-1].view(used, used), float(sums[-1])

@@ -100,6 +100,16 @@ def test_jackknife_agrees_with_leaving_the_renders_out(count, groups, dtype):
     assert error == pytest.approx(expected, rel={torch.float32: 1e-4, torch.float64: 1e-9}[dtype])
 
 
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16])
+def test_autocast_does_not_reduce_the_precision_of_the_jackknife(kind):
+    """The sums of 32 renders over the pixels of a row have products above 65504, the largest number of float16."""
+    renders = torch.randint(0, 2, (256, 1, 1, 1), generator=torch.Generator().manual_seed(0)).float()
+    moments, visible = pooled(renders.expand(-1, 3, 2, 2000), 8), torch.ones(2, 2000, dtype=torch.bool)
+    with torch.autocast("cpu", dtype=kind):
+        error = moments.jackknife_error(visible)
+    assert error == moments.jackknife_error(visible) > 0
+
+
 @pytest.mark.parametrize(("n", "count"), [(3, 3), (2, 4), (1, 5)])
 def test_the_squared_error_of_an_adaptive_score_is_its_variance_on_average(n, count):
     """Over all tuples of masks at rate 1/2, exactly. With one Gaussian every mask is equally far from the mean."""
