@@ -122,12 +122,12 @@ def check_count(x: Any, name: str, *, minimum: int, hint: str = "") -> None:
         raise ValueError(f"{name} must be at least {minimum}, got {x}{hint}.")
 
 
-def rate_like(p: Rate, opacity: Tensor) -> Rate:
-    """Return rates that broadcast to opacities (N,) or (N, 1): a tensor (N,) in their shape and dtype, else as is."""
+def kept_share(p: Rate, opacity: Tensor) -> Rate:
+    """Return ``1 - p``; for a tensor (N,) of rates in the shape of the opacities, (N,) or (N, 1), but its own dtype."""
     if not (isinstance(p, Tensor) and p.ndim):
-        return p
+        return 1.0 - p
     check_per_gaussian(p, opacity, "p")
-    return p.view_as(opacity).to(opacity.dtype)
+    return 1.0 - p.view_as(opacity)
 
 
 def is_zero(rate: Rate) -> bool:

@@ -19,7 +19,7 @@ from ca_reg._check import (
     check_sigma,
     check_tensor,
     is_zero,
-    rate_like,
+    kept_share,
 )
 from ca_reg._random import draw_numbers
 from ca_reg.functional.multipliers import Multiplier
@@ -111,7 +111,8 @@ def apply_dropout(opacity: Tensor, keep: Tensor, *, p: Rate = 0.0, compensate: b
 
 def compensated(opacity: Tensor, p: Rate) -> Tensor:
     """Multiply survivors by ``1 / (1 - p)``, at rates that are known to be in [0, 1): reading them waits for a card."""
-    return opacity * (1.0 / (1.0 - rate_like(p, opacity)))
+    # Rounded last: in 16 bits a rate near 1 is 1, and dropped Gaussians would have 0 times infinity.
+    return (opacity * (1.0 / kept_share(p, opacity))).to(opacity.dtype)
 
 
 def gaussian_dropout(
@@ -231,7 +232,7 @@ def scale_opacity(opacity: Tensor, p: Rate) -> Tensor:
     """
     check_opacity(opacity)
     check_rates(p)
-    return opacity if is_zero(p) else opacity * (1.0 - rate_like(p, opacity))
+    return opacity if is_zero(p) else (opacity * kept_share(p, opacity)).to(opacity.dtype)
 
 
 def expected_opacity(opacity: Tensor, sigma: float, *, clip: bool = False) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ca_reg import functional
-from ca_reg._check import Rate, check_rate, is_zero, rate_like
+from ca_reg._check import Rate, check_rate, is_zero
 from ca_reg.functional import Multiplier
 from ca_reg.functional.opacities import compensated, keep_mask
 from ca_reg.regularizer import Draw, Params, Regularizer
@@ -93,7 +93,7 @@ class IndependentDropout(Regularizer):
     def _alpha_factor(self, x: Params, rates: Rate) -> tuple[Params, Multiplier]:
         if self.compensate:
             # Survivors may exceed 1: the renderer's clamp must see them before the factor does.
-            x = x._replace(opacities=x.opacities / (1.0 - rate_like(rates, x.opacities)))
+            x = x._replace(opacities=compensated(x.opacities, rates))
         return x, Multiplier.dropout(rates)
 
 

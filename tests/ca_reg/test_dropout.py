@@ -34,6 +34,17 @@ def test_survivors_of_compensated_dropout_may_exceed_one():
     assert apply_dropout(torch.tensor([1.0]), torch.tensor([True]), p=0.5, compensate=True).item() == 2.0
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_rates_of_their_own_are_not_rounded_to_16_bits(dtype):
+    """There the last three are 1, or 1 - p has one digit."""
+    rates = torch.tensor([0.2, 0.7, 0.9985, 0.9999, 1 - 1e-6, 1 - 1e-7])
+    opacity, keep = torch.full((6, 1), 0.5, dtype=dtype), torch.tensor([True] * 4 + [False] * 2)
+    shares = (1 - rates.double())[:, None]
+    torch.testing.assert_close(scale_opacity(opacity, rates), (0.5 * shares).to(dtype))
+    raised = torch.where(keep[:, None], 0.5 / shares, 0).to(dtype)
+    torch.testing.assert_close(apply_dropout(opacity, keep, p=rates, compensate=True), raised)
+
+
 @pytest.mark.parametrize("p", [0.05, 0.2, 0.6])
 def test_masks_keep_the_stated_fraction_independently(p):
     n = 200_000
