@@ -26,13 +26,18 @@ def check_tensor(x: Any, name: str, remedy: str = "") -> None:
         raise TypeError(f"{name} must be a torch tensor, got {type(x).__name__}{remedy and '; '}{remedy}.")
 
 
+def check_floating(x: Any, name: str, remedy: str = "", *, cast: str = "convert it with .float()") -> None:
+    """Raise a TypeError unless ``x`` is a floating-point tensor; ``cast`` is the remedy where it is another tensor."""
+    check_tensor(x, name, remedy)
+    if not x.is_floating_point():
+        raise TypeError(f"{name} must be a floating-point tensor, got {x.dtype}; {cast}.")
+
+
 def check_opacity(opacity: Any) -> None:
     """Raise unless ``opacity`` is a floating-point tensor of shape (N,) or (N, 1)."""
-    check_tensor(opacity, "opacity", "convert it with torch.as_tensor")
+    check_floating(opacity, "opacity", "convert it with torch.as_tensor")
     if opacity.ndim not in (1, 2) or opacity.shape[1:] not in ((), (1,)):
         raise ValueError(f"opacity must have shape (N,) or (N, 1), one per Gaussian, got {tuple(opacity.shape)}.")
-    if not opacity.is_floating_point():
-        raise TypeError(f"opacity must be a floating-point tensor, got {opacity.dtype}; convert it with .float().")
 
 
 def check_opacity_range(opacity: Tensor, upper: float = 1.0) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ca_reg._check import check_finite, check_tensor
+from ca_reg._check import check_finite, check_floating
 
 __all__ = ["expected_absolute_error", "expected_squared_error"]
 
@@ -128,8 +128,6 @@ def _slopes(d: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
 def _check(mean: Tensor, variance: Tensor, target: Tensor) -> None:
     """Raise unless all three are floating-point tensors of one shape."""
     for name, x in (("mean", mean), ("variance", variance), ("target", target)):
-        check_tensor(x, name)
-        if not x.is_floating_point():
-            raise TypeError(f"{name} must be a floating-point tensor, got {x.dtype}; scale images to [0, 1].")
+        check_floating(x, name, cast="scale images to [0, 1]")
         if x.shape != mean.shape:
             raise ValueError(f"{name} must have the shape of mean, {tuple(mean.shape)}, got {tuple(x.shape)}.")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ca_reg._check import Rate, check_finite, check_opacity_range, check_rates
+from ca_reg._check import Rate, check_finite, check_floating, check_opacity_range, check_rates
 
 __all__ = ["Multiplier"]
 
@@ -118,8 +118,7 @@ class Multiplier:
             >>> noise.mean, noise.variance
             (tensor([1.0000, 0.9202]), tensor([0.0400, 0.0136]))
         """
-        if not isinstance(opacity, Tensor) or not opacity.is_floating_point():
-            raise TypeError("opacity must be a floating-point torch tensor of activated opacities.")
+        check_floating(opacity, "opacity")
         check_opacity_range(opacity, upper=math.inf)
         check_finite(sigma, "sigma", minimum=0.0)
         if sigma == 0:

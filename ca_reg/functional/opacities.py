@@ -12,12 +12,12 @@ from ca_reg._check import (
     check_count,
     check_factor,
     check_finite,
+    check_floating,
     check_opacity,
     check_opacity_range,
     check_per_gaussian,
     check_rates,
     check_sigma,
-    check_tensor,
     is_zero,
     kept_share,
 )
@@ -183,6 +183,7 @@ def apply_opacity_noise(opacity: Tensor, noise: Tensor) -> Tensor:
     """
     check_opacity(opacity)
     check_per_gaussian(noise, opacity, "noise")
+    check_floating(noise, "noise")
     # Computed in the wider of the two dtypes and rounded once: in bfloat16, 1 + noise would have 8 bits.
     noisy = opacity * (1.0 + noise.view_as(opacity))
     # Not clamp, whose gradient at the bounds is 1 in torch 2.13 and 0 in torch 2.15.
@@ -285,9 +286,7 @@ def decayed_logits(logits: Tensor, factor: float) -> Tensor:
         >>> decayed_logits(torch.tensor([0.0, 3.0]), 0.5).sigmoid()
         tensor([0.2500, 0.4763])
     """
-    check_tensor(logits, "logits", "give the parameter whose sigmoid is the opacity")
-    if not logits.is_floating_point():
-        raise TypeError(f"logits must be a floating-point tensor, got {logits.dtype}.")
+    check_floating(logits, "logits", "give the parameter whose sigmoid is the opacity")
     if logits.dtype == torch.bfloat16:
         raise TypeError("bfloat16 is too coarse for opacities that decay: keep the trained logits in float32.")
     check_factor(factor)

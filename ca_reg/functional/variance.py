@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ca_reg._check import check_tensor
+from ca_reg._check import check_floating
 from ca_reg.result import Reason
 
 __all__ = ["ColorVariance", "color_variance"]
@@ -48,8 +48,8 @@ def color_variance(weights: Tensor, colors: Tensor) -> ColorVariance:
         >>> cv.variance, cv.covered, cv.value
         (tensor([0.2500, 0.0000, 0.0000]), tensor([ True,  True, False]), tensor(0.1250))
     """
-    check_tensor(weights, "weights", "of shape (..., n)")
-    check_tensor(colors, "colors", "of shape (..., n, 3)")
+    check_floating(weights, "weights", "of shape (..., n)")
+    check_floating(colors, "colors", "of shape (..., n, 3)", cast="scale colors to [0, 1]")
     if colors.ndim < 2 or colors.shape[-1] != 3:
         raise ValueError(f"colors must have shape (..., n, 3), RGB last, got {tuple(colors.shape)}.")
     if colors.shape[:-1] != weights.shape:
