@@ -105,7 +105,7 @@ def expected_error(features: Mapping[str, Tensor], mask: Tensor | None = None, *
 
     Raises:
         TypeError: if a feature is no tensor.
-        ValueError: if no form has its features, or the shapes differ.
+        ValueError: if no form has its features, the shapes differ, or the mask is not bool.
 
     Example:
         >>> flat, step = torch.zeros(8, 8), torch.zeros(8, 8)
@@ -123,6 +123,8 @@ def expected_error(features: Mapping[str, Tensor], mask: Tensor | None = None, *
     shapes = {features[name].shape for name in form.needs}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2:
         raise ValueError(f"features must share one shape (H, W), got {', '.join(str(tuple(x)) for x in shapes)}.")
+    if mask is not None and (mask.dtype != torch.bool or mask.shape not in shapes):
+        raise ValueError(f"mask must be bool and of the features' shape, got {mask.dtype}, {tuple(mask.shape)}.")
     total = torch.zeros_like(features["deviation" if "deviation" in form.needs else "empty"])
     for term, weight in form.weights.items():
         total = total + weight * math.prod((features[name] for name in _factors(term)), start=torch.ones_like(total))

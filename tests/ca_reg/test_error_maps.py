@@ -180,6 +180,9 @@ def test_errors_say_what_is_missing():
         expected_error(flat(deviation=0.1))
     with pytest.raises(ValueError, match="share one shape"):
         expected_error({"empty": torch.zeros(3, 4), "contrast": torch.zeros(4, 4)})
+    for mask in (torch.ones(SIZE, dtype=torch.int64), torch.ones(SIZE[0], dtype=torch.bool)):  # both index rows
+        with pytest.raises(ValueError, match="mask must be"):
+            expected_error(flat(empty=0.1, contrast=0.1), mask)
     with pytest.raises(TypeError, match=r"empty .*torch tensor"):
         expected_error({"empty": 0.5, "contrast": torch.zeros(4, 4)})
     with pytest.raises(ValueError, match="alpha"):
