@@ -126,20 +126,14 @@ class Chain(Regularizer):
 
     def expected(self, x: Params) -> Params:
         """Return the test-time value of all members."""
-        # The mean of a product is not the product of the means where the factor of one depends on the opacity that
-        # another has changed, as that of clamped noise does; the moments of the composed factor account for that.
-        means = [member for member in self if member.renders_mean]
-        for member in means:
-            member.check_needs(x)
-        if len(means) > 1 and (both := _alpha_factor(means, x, test=True)) is not None:
-            x = both[0]._replace(opacities=(both[0].opacities * both[1].mean).to(x.opacities.dtype))
-        else:
-            for member in means:
-                x = member.expected(x)
+        means: list[Regularizer] = []
         for member in self:
-            if not member.renders_mean:
-                x = member.expected(x)
-        return x
+            if member.renders_mean:
+                member.check_needs(x)
+                means.append(member)
+            elif (out := member.expected(x)) is not x:  # of a foreign module, which meets what those before it render
+                x, means = member.expected(_joint_mean(means, x)) if means else out, []
+        return _joint_mean(means, x)
 
     def alpha_factor(self, x: Params) -> tuple[Params, Multiplier] | None:
         """Return the product of the multipliers; None if a member has none, or noise stands behind a soft factor."""
@@ -221,6 +215,17 @@ def _combine_draws(draws: Sequence[Draw | None]) -> Draw:
     """Combine the draws of all members: a Gaussian is kept if no member drops it."""
     kept = [draw.keep for draw in draws if draw is not None and draw.keep is not None]
     return Draw(tuple(draws), functools.reduce(torch.logical_and, kept) if kept else None)
+
+
+def _joint_mean(members: list[Regularizer], x: Params) -> Params:
+    """Return the mean over the draws of members that each render theirs."""
+    # The mean of a product is not the product of the means where the factor of one depends on the opacity that another
+    # has changed, as that of clamped noise does; the moments of the composed factor account for that.
+    if len(members) > 1 and (both := _alpha_factor(members, x, test=True)) is not None:
+        return both[0]._replace(opacities=(both[0].opacities * both[1].mean).to(x.opacities.dtype))
+    for member in members:
+        x = member.expected(x)
+    return x
 
 
 def _alpha_factor(members: list[Regularizer], x: Params, *, test: bool = False) -> tuple[Params, Multiplier] | None:

@@ -178,6 +178,23 @@ def test_foreign_modules_are_members():
         Chain(torch.relu)
 
 
+class AtMost(nn.Module):
+    """Like those of this package, it takes the generator of a draw."""
+
+    def forward(self, opacity, generator=None):
+        return opacity.clamp(max=0.6)
+
+
+def test_a_foreign_module_keeps_its_place_at_test_time():
+    dropout, noise = GaussianDropout(0.5), OpacityNoise(0.8, scale=True)
+    for members in ((AtMost(), dropout), (noise, AtMost(), dropout), (dropout, AtMost())):
+        torch.testing.assert_close(Chain(*members).eval()(OPACITY), nn.Sequential(*members).eval()(OPACITY))
+    chain = Chain(AtMost(), dropout, noise).train()
+    draws = torch.stack([chain(OPACITY, generator=torch.Generator().manual_seed(i)) for i in range(4_000)])
+    error = draws.std(0) / len(draws) ** 0.5
+    assert ((draws.mean(0) - chain.eval()(OPACITY)).abs() < 5 * error).all()  # false alarm: 6e-7 for each of four
+
+
 def test_a_bare_tensor_meets_the_step_that_a_member_was_told():
     dropout = GaussianDropout(lambda step: 0.9 * (step >= 50))
     chain, opacity = Chain(OpacityNoise(0.0), nn.Sequential(dropout)), torch.full((1000,), 0.5)
