@@ -33,7 +33,7 @@ class Multiplier:
 
     Args:
         mean: at least 0; a number for all splats, or a tensor with one value per splat or Gaussian, which is checked
-            and thereby synchronizes a GPU.
+            and thereby synchronizes a GPU, but not inside ``torch.compile``.
         variance: at least 0, likewise.
 
     Example:
@@ -49,7 +49,7 @@ class Multiplier:
         for name, x in (("mean", self.mean), ("variance", self.variance)):
             if not isinstance(x, Tensor):
                 check_finite(x, f"the {name} of a multiplier", minimum=0.0)
-            elif not bool(((x >= 0) & x.isfinite()).all()):
+            elif not torch.compiler.is_compiling() and not bool(((x >= 0) & x.isfinite()).all()):
                 raise ValueError(f"the {name} of a multiplier must be finite and at least 0, got a value that is not.")
 
     def __mul__(self, other: Multiplier) -> Multiplier:

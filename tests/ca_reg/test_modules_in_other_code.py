@@ -147,6 +147,7 @@ CALLS = {
     "noise": (OpacityNoise, {"clip": True}, True),
     "dropout in evaluation": (GaussianDropout, {}, False),
     "noise in evaluation": (OpacityNoise, {}, False),
+    "two in evaluation": (lambda rate: Chain(GaussianDropout(0.1), GaussianDropout(rate)), {}, False),
 }
 
 
