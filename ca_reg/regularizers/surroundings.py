@@ -86,13 +86,13 @@ def with_own_memory(module: M) -> M:
 
     So a score may measure with the regularizer of a training, at whatever step and model, and not change its draws.
     """
+    if isinstance(module, Refreshed):
+        return Refreshed(1)  # type: ignore[return-value]  # of the model that is scored, not of an earlier one
     if not any(isinstance(part, Refreshed) for part in module.modules()):
         return module
     # Shallow: parameters and schedules stay shared, only the memory is its own.
     twin = copy.copy(module)
     twin._modules = {name: part and with_own_memory(part) for name, part in module._modules.items()}
-    if isinstance(twin, Refreshed):
-        twin._buffers = {"value": None}
     return twin
 
 

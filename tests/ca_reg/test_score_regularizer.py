@@ -153,6 +153,22 @@ def test_what_does_not_go_together_is_refused(make, arguments, message):
         make(render, **arguments)(OPACITY, None)
 
 
+@pytest.mark.parametrize("text", ["density", "geometry", "d2gs", "d2gs(literal=True)"])
+def test_a_score_measures_the_model_that_it_is_given_whatever_it_has_scored_before(text):
+    """Of as many Gaussians and a few steps earlier, which a training would not measure again."""
+
+    def moments(opacity, view, multiplier, background):
+        variance = (multiplier.variance * torch.arange(50)).mean().expand(3, 4, 4)
+        return {"mean": variance, "variance": variance / 100, "alpha_mean": torch.ones(4, 4)}
+
+    generator = torch.Generator().manual_seed(0)
+    models = [Params(torch.ones(50), torch.randn(50, 3, generator=generator), view_matrix=torch.eye(4), step=step)
+              for step in (1000, 1010)]  # fmt: skip
+    scores = [CAScore.exact(moments, regularizer=parse(text)) for _ in range(2)]
+    values = [scores[0](model, None).value for model in models]
+    assert values[1] == scores[1](models[1], None).value != values[0]
+
+
 @pytest.mark.parametrize(
     "text", ["density", "geometry", "clustered(0.4)", "drop_anchors(0.1)", "dropout(0.3) + density"]
 )
