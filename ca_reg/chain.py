@@ -204,7 +204,7 @@ class WrappedModule(Regularizer):
 
 def _flatten(module: nn.Module) -> list[Regularizer]:
     """Return the members of a chain in order."""
-    if isinstance(module, Chain):
+    if type(module) is Chain:  # a subclass may do something else with its members than one after the other
         return list(module)
     if isinstance(module, nn.Sequential) and type(module).forward is nn.Sequential.forward:
         return [member for child in module for member in _flatten(child)]

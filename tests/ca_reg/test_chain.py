@@ -178,6 +178,22 @@ def test_foreign_modules_are_members():
         Chain(torch.relu)
 
 
+class FirstAlone(Chain):
+    """Does something else with its members."""
+
+    def regularize(self, x, generator=None):
+        x = (first := next(iter(self))).regularize(x, generator)
+        self.last = first.last
+        return x
+
+
+def test_a_chain_of_another_kind_stays_what_it_is_in_a_chain():
+    chain = Chain(FirstAlone(GaussianDropout(0.5), OpacityNoise(0.5)), Chain(GaussianDropout(0.0)))
+    opacity = torch.full((400,), 0.6)
+    assert torch.equal(chain(opacity), opacity * chain.keep)
+    assert len(chain) == 2
+
+
 class AtMost(nn.Module):
     """Like those of this package, it takes the generator of a draw."""
 
