@@ -23,6 +23,7 @@ def draw_numbers(
     ``device`` is taken.
 
     Raises:
+        ValueError: if a score draws with another function, whose numbers it cannot compute.
         RuntimeError: if a generator is used during a backward pass, where a recomputed draw would differ.
 
     Example:
@@ -70,6 +71,8 @@ class PortableGenerator(torch.Generator):
 
     def numbers(self, sample: Callable[..., Tensor], n: int, device: torch.device | str | None) -> Tensor:
         """Return the next n numbers of ``torch.rand`` or ``torch.randn``, float32."""
+        if sample is not torch.rand and sample is not torch.randn:
+            raise ValueError(f"sample must be torch.rand or torch.randn, got {sample!r}: transform what these return.")
         words = self._words(n, device)
         uniform = (words >> 40 & 0xFFFFFF).float() * 2**-24  # the upper 24 bits: what a float32 holds
         if sample is torch.rand:

@@ -46,6 +46,12 @@ def test_numbers_are_those_of_the_processor_and_computed_on_the_card(card, sampl
     assert draw_numbers(sample, 1000, PortableGenerator(0), "meta").device.type == "meta"
 
 
+def test_numbers_of_another_function_are_refused():
+    """They had been normal."""
+    with pytest.raises(ValueError, match=r"torch\.rand or"):
+        draw_numbers(lambda *size, **where: 9 + torch.rand(*size, **where), 3, PortableGenerator(0), "cpu")
+
+
 def test_own_draws_from_it_are_those_of_a_generator_on_the_cpu():
     draws = [torch.rand(3, generator=PortableGenerator(seed)) for seed in (0, 0, 1)]
     assert torch.equal(draws[0], draws[1])
