@@ -86,6 +86,11 @@ class Chain(Regularizer):
         for member in self:
             member.set_step(step)
 
+    def hold(self, step: int) -> None:
+        """Keep the rates of all members."""
+        for member in self:
+            member.hold(step)
+
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         # The chain and its members of constant rate save no step. If they stayed at a later one that was set before,
         # the step of the whole, which is the latest of all, would not go back to the saved one.

@@ -187,7 +187,6 @@ class CAResult(_Score):
             ImportError: if matplotlib is missing; it comes with ``ca_reg[plot]``.
         """
         ax = new_axes() if ax is None else ax
-        # The root, because a few pixels hold most of the variance.
         heat = self.variance.sqrt().masked_fill(~self.visible, math.nan).cpu().numpy()
         ax.set_facecolor("0.6")
         image = ax.imshow(heat, cmap="inferno", vmin=0.0)

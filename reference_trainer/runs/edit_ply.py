@@ -200,8 +200,7 @@ def refined(model: TrainedModel, scene: Scene, steps: int, device: str = "cpu") 
     )  # fmt: skip
     trainer = Trainer(replace(scene, start=start), config, device)
     trainer.step = first
-    for member in trainer.regularizer:
-        member.hold(max(first - 1, 0))  # as in `TrainedModel.params`
+    trainer.regularizer.hold(max(first - 1, 0))  # as in `TrainedModel.params`
     with threads_for(scene.pixels):
         trainer.train()
     return replace(model, gaussians=trainer.gaussians.map(Tensor.detach))

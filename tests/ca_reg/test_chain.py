@@ -178,6 +178,13 @@ def test_foreign_modules_are_members():
         Chain(torch.relu)
 
 
+def test_a_chain_holds_the_rates_of_its_members():
+    chain = Chain(GaussianDropout(lambda step: step / 100), GaussianDropout(0.5)).eval()
+    chain.hold(20)
+    chain.set_step(90)
+    torch.testing.assert_close(chain(OPACITY), 0.8 * 0.5 * OPACITY)
+
+
 class FirstAlone(Chain):
     """Does something else with its members."""
 
