@@ -144,6 +144,10 @@ class Chain(Regularizer):
         """Return the product of the multipliers; None if a member has none, or noise stands behind a soft factor."""
         return _alpha_factor(list(self), x)
 
+    def test_alpha_factor(self, x: Params) -> tuple[Params, Multiplier] | None:
+        """Return the same for a finished model."""
+        return _alpha_factor(list(self), x, test=True)
+
 
 class WrappedModule(Regularizer):
     """Adapter that lets any module on activated opacities (N,) act as a regularizer, called in its own mode.

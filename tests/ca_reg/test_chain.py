@@ -185,6 +185,17 @@ def test_a_chain_holds_the_rates_of_its_members():
     torch.testing.assert_close(chain(OPACITY), 0.8 * 0.5 * OPACITY)
 
 
+def test_the_multiplier_of_a_finished_model_does_not_come_from_the_neighbors_of_training():
+    generator = torch.Generator().manual_seed(0)
+    first, last = (Params(torch.full((40,), 0.5), torch.randn(40, 3, generator=generator), step=step)
+                   for step in (1, 20))  # fmt: skip
+    chain = Chain(REGULARIZERS.make_one("density"), GaussianDropout(0.5))
+    chain(first)
+    expected = Chain(REGULARIZERS.make_one("density"), GaussianDropout(0.5)).alpha_factor(last)[1]
+    assert torch.equal(chain.test_alpha_factor(last)[1].mean, expected.mean)
+    assert not torch.equal(chain.alpha_factor(last)[1].mean, expected.mean)
+
+
 class FirstAlone(Chain):
     """Does something else with its members."""
 
