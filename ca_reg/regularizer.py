@@ -61,10 +61,12 @@ class Params(NamedTuple):
         A regularizer that reads them lists ``means`` and ``view_matrix`` in its ``needs``. Without gradients.
 
         Raises:
-            ValueError: if there are no means or no view matrix.
+            ValueError: if there are no means or no view matrix, or it is that of several cameras.
         """
         if self.means is None or self.view_matrix is None:
             raise ValueError("depths need means and view_matrix; list both in the needs of the regularizer.")
+        if self.view_matrix.shape != (4, 4):
+            raise ValueError(f"view_matrix must have shape (4, 4), of one camera, got {tuple(self.view_matrix.shape)}.")
         means = at_least_single(self.means.detach())
         row = self.view_matrix.detach()[2].to(means)  # for column vectors, the third row is the viewing direction
         with without_autocast(means.device):  # which would round the product to 16 bits

@@ -57,6 +57,9 @@ CASES = {
     "an unknown name": (ValueError, "no regularizer", lambda: ca_reg.regularizers.parse("dropuot(0.2)")),
     "a negative weight": (ValueError, "negative", lambda: F.color_variance(-half, torch.ones(5, 3))),
     "a missing field": (ValueError, "needs means", lambda: ca_reg.regularizers.parse("density")(half)),
+    "a batch of cameras": (
+        ValueError, "(4, 4)", lambda: Params(half, torch.ones(5, 3), view_matrix=torch.eye(4).expand(4, 4, 4)).depths
+    ),
     "a score of (3, 4)": (ValueError, "shape (N,) or (N, 1)", lambda: score(wide, None)),
     "a score of numpy": (TypeError, "opacity must be a torch tensor", lambda: score(half.numpy(), None)),
     "a mask for noise": (TypeError, "noise must be", lambda: F.apply_opacity_noise(half, half > 0)),
