@@ -173,8 +173,9 @@ class Hook(abc.ABC):
 
     def _stepped(self, optimizer: Optimizer, args: Any, kwargs: Any) -> None:
         logits = [x for group in optimizer.param_groups if group.get("name") in OPACITY_GROUPS for x in group["params"]]
-        if logits:
-            self._optimized += 1
+        self._optimized += bool(logits)
+        # A last stage may freeze the Gaussians, and step their optimizers all the same (gsplat 1.6 with PPISP).
+        if any(x.requires_grad for x in logits):
             self._idle += 1
             self._check(self._idle, "optimizer steps of the Gaussians in a row, and no render was regularized")
             if self._decay is not None:

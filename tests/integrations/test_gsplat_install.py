@@ -101,6 +101,19 @@ def test_opacities_decay_after_their_own_optimizers_steps(fake_gsplat, params, c
     assert all(torch.equal(params[name], x) for name, x in before.items())
 
 
+def test_frozen_gaussians_neither_decay_nor_count_as_missed(fake_gsplat, params, cameras):
+    optimizer = torch.optim.Adam([{"params": [params["opacities"]], "name": "opacities"}], lr=0.0)
+    before = torch.sigmoid(params["opacities"].detach())
+    with install(GaussianDropout(0.5), decay=OpacityDecay(0.9, start=0), patience=2):
+        fake_gsplat.rasterization(**activated(params), **cameras)[0].sum().backward()
+        optimizer.step()
+        params.requires_grad_(False)
+        for _ in range(4):
+            fake_gsplat.rasterization(**activated(params), **cameras)
+            optimizer.step()
+    torch.testing.assert_close(torch.sigmoid(params["opacities"]), 0.9 * before)
+
+
 @pytest.mark.parametrize("trains", [False, True])
 def test_a_process_that_only_evaluates_is_past_its_schedule(fake_gsplat, params, cameras, trains):
     seen = []
