@@ -31,7 +31,7 @@ from ca_reg.decay import OpacityDecay
 from ca_reg.regularizers import parse
 from ca_reg.schedules import LinearRamp, Schedule, StartStop
 
-from ._calls import MODULES
+from ._calls import MODULES, RASTERIZERS
 from ._report import Hook
 from ._scripts import (
     ScriptAudit,
@@ -195,9 +195,9 @@ def parse_options(arguments: Sequence[str] | None, *, in_child: bool = False) ->
     else:
         options.script, options.arguments = script, command[1:]
     options.sources = sources = read_script(options.script)
-    of_inria = sources.rasterizers or not sources.packages.isdisjoint(MODULES)
+    options.of_inria = sources.rasterizers or not sources.packages.isdisjoint(MODULES)
     # A rasterizer by name is one of INRIA's: gsplat may be another, optional back end.
-    options.gsplat = not of_inria and options.rasterizer is None and sources.need("gsplat")
+    options.gsplat = not options.of_inria and options.rasterizer is None and sources.need("gsplat")
     meaningless = [name for name in _OF_INRIA if getattr(options, name) != parser.get_default(name)]
     if options.gsplat and meaningless:
         parser.error(f"{options.script} is one of gsplat's, for which there is no --{meaningless[0].replace('_', '-')}")
@@ -257,7 +257,8 @@ def _hook(options: argparse.Namespace) -> Hook | None:
         Chain(*members),
         scope=options.scope,
         seed=options.seed,
-        rasterizer=options.rasterizer,
+        # A script that names none may lack this one: others, which it starts, have theirs.
+        rasterizer=options.rasterizer or (None if options.of_inria else RASTERIZERS[0]),
         candidates=options.sources.classes,
         models=dict.fromkeys([DEFAULT_MODEL, *options.sources.models]),
         steps=options.steps or ("updates" if options.sources.models else "parameters"),

@@ -144,8 +144,11 @@ def test_a_missing_extension_is_named_with_the_ways_out(repository, capsys, name
     assert (f"--rasterizer {name}:CLASS" in problem) == offered  # for what may rasterize
 
 
-def test_a_script_that_does_not_render_is_an_error(repository, tmp_path, capsys):
+@pytest.mark.parametrize("installed", [True, False])  # a script may start others, which bring theirs
+def test_a_script_that_does_not_render_is_an_error(repository, tmp_path, capsys, installed):
     (repository / "other.py").write_text("print('done')\n")
+    if not installed:
+        (repository / "diff_gaussian_rasterization.py").unlink()
     report = tmp_path / "report.json"
     assert launch("--dropout", 0.2, "--report", report, repository / "other.py") == 1
     err = capsys.readouterr().err
