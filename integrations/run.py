@@ -21,7 +21,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, chdir, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
@@ -83,7 +83,7 @@ def _launch(options: argparse.Namespace, arguments: Sequence[str], audit: Script
             # A process may run another script; it gets all of the launcher's own options, which stand before this one.
             name = ["-m", options.script] if options.module else [str(options.script.resolve())]
             own = arguments[: len(arguments) - len(options.arguments) - (2 if options.module else 1)]
-            undo.enter_context(in_children(f"{__package__}.run:resume", own, name))
+            undo.enter_context(in_children(f"{__package__}.run:resume", own, name, os.getcwd()))
         undo.enter_context(audit)
         undo.enter_context(old_aliases())
         undo.enter_context(_reported(options, hook, audit))
@@ -112,25 +112,26 @@ def _guard(options: argparse.Namespace, saved: str | None) -> None:
         raise SystemExit(code)
 
 
-def resume(arguments: Sequence[str], script: Sequence[str]) -> None:
+def resume(arguments: Sequence[str], script: Sequence[str], folder: str) -> None:
     """Hook a process that a launched script has started, and report to the launcher when it ends.
 
-    ``arguments`` are the launcher's options, ``script`` is the launched one, or ``-m`` and its module. A script of this
-    process's own takes its place.
+    ``arguments`` are the launcher's options, whose paths and modules are relative to its ``folder``; ``script`` is the
+    launched one, or ``-m`` and its module. A script of this process's own takes its place.
     """
-    own = Path(sys.argv[0])
+    own = Path(sys.argv[0]).absolute()
     this = [str(own)] if own.suffix == ".py" and own.is_file() else script
     undo = ExitStack()
     undo.enter_context(old_aliases())
     atexit.register(undo.close)  # holds them until the end
-    hook: Hook = parse_options([*arguments, *this], in_child=True).hook
+    with chdir(folder):
+        hook: Hook = parse_options([*arguments, *this], in_child=True).hook
     hook.install()
-    folder = folder_of_reports()
+    reports = folder_of_reports()
 
     def report() -> None:
         if hook.used:  # data loaders, say, render nothing
             found = {"renders": hook.tally.as_dict(), "done": hook.tally.lines(), "problem": hook.problem()}
-            path = Path(folder, f"{os.getpid()}.json")
+            path = Path(reports, f"{os.getpid()}.json")
             path.write_text(json.dumps({"script": own.name, **found}), encoding="utf-8")
 
     atexit.register(report)

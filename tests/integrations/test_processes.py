@@ -43,6 +43,19 @@ def test_scripts_that_a_script_starts_are_hooked(repository, tmp_path):
     assert found == {"render.py": 0, "train.py": 2}
 
 
+@pytest.mark.slow
+def test_relative_paths_of_the_options_hold_in_a_process_that_starts_elsewhere(repository, tmp_path):
+    (tmp_path / "my_module.py").write_text("from ca_reg import GaussianDropout as Own\n")
+    (tmp_path / "garden").mkdir()
+    start = f'import subprocess, sys\nsubprocess.run([sys.executable, "train.py", "2"], cwd={str(repository)!r})\n'
+    (tmp_path / "all.py").write_text(start)
+    options = ("--regularizer", "my_module:Own(0.5)", "--guard", "garden")
+    done = run(*options, "--report", "report.json", "all.py", cwd=tmp_path)
+    assert "--guard" in done.stderr  # which has no model to clean
+    (child,) = json.loads((tmp_path / "report.json").read_text())["started"]
+    assert (child["renders"]["regularized"], child["problem"]) == (2, None)
+
+
 RANKS = """
 import torch
 import torch.distributed as distributed
