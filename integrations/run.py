@@ -314,7 +314,7 @@ def _problem(hook: Hook | None) -> str | None:
     if hook is None:
         return None
     children = reports_of_children()
-    own = hook.problem() if hook.used or not any(child["renders"] for child in children) else None
+    own = hook.problem() if hook.used or not children else None
     return own or next((f"{child['script']}: {child['problem']}" for child in children if child["problem"]), None)
 
 

@@ -105,6 +105,15 @@ def test_a_process_that_trains_past_the_hook_fails_the_run(repository):
     assert re.search(r"ERROR: train\.py: .*not regularized", done.stderr)
 
 
+@pytest.mark.slow
+def test_why_a_process_was_not_hooked_is_the_error_of_the_run(tmp_path):
+    (tmp_path / "train.py").write_text("import torch\ndef render():\n    import diff_gaussian_rasterization\n")
+    (tmp_path / "all.py").write_text('import subprocess, sys\nsubprocess.run([sys.executable, "train.py"])\n')
+    done = run("--dropout", 0.5, "all.py", cwd=tmp_path)
+    assert done.returncode == 1
+    assert re.search(r"ERROR: train\.py: .*ImportError", done.stderr)
+
+
 @pytest.mark.parametrize(
     ("command", "changes", "named"),
     [
