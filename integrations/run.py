@@ -183,8 +183,8 @@ def parse_options(arguments: Sequence[str] | None, *, in_child: bool = False) ->
     options = parser.parse_args(arguments)
     command = options.command[options.command[:1] == ["--"] :]
     if options.module is not None:
-        if not options.module:
-            parser.error("-m needs the name of a module")
+        if not options.module or command:  # argparse takes -mMODULE without what follows it
+            parser.error("-m needs the name of a module, after a space")
         options.script, *options.arguments = options.module
         # Only the package: finding a submodule would import the package, before the hook is installed.
         if find_spec(options.script.partition(".")[0]) is None:

@@ -362,6 +362,7 @@ def test_an_installed_command_is_a_script_as_well(tmp_path, monkeypatch):
         ([], "there is no script"),
         ([sys.executable, "SCRIPT"], "is a program, not a script of Python"),
         (["-m"], "-m needs the name of a module"),
+        (["-mos", "1"], "-m needs the name of a module"),
         (["-m", "nowhere.train"], "there is no module nowhere.train"),
         (["--patience", "-1", "SCRIPT"], "--patience must be at least 0"),
         (["--rasterizer", "Mine", "SCRIPT"], "--rasterizer must be module:Class, got Mine"),
