@@ -211,6 +211,7 @@ class AfterTorch:
             return None
         sys.meta_path.remove(cls)
         spec = importlib.util.find_spec(name)
+        sys.meta_path.insert(0, cls)  # many packages only ask whether torch is there, before anyone imports it
         if spec is not None:
             run = spec.loader.exec_module
             spec.loader.exec_module = lambda module: (run(module), begin())

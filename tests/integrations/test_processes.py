@@ -139,6 +139,16 @@ def test_the_last_model_and_the_last_ply_are_noticed(tmp_path):
     assert (audit.saved_ply, audit.saved) == (str(tmp_path / "last.ply"), str(tmp_path / "metrics.npz"))
 
 
+@pytest.mark.parametrize("first", ["", "import importlib.util; assert importlib.util.find_spec('torch'); "])
+def test_the_first_import_of_torch_is_noticed_and_not_a_search_for_it(tmp_path, first):
+    (tmp_path / "torch.py").write_text("")
+    with in_children("builtins:print", "called"):
+        done = subprocess.run(
+            [sys.executable, "-c", first + "import torch"], cwd=tmp_path, capture_output=True, text=True, check=True
+        )
+    assert done.stdout == "called\n", done.stderr
+
+
 def test_a_sitecustomize_of_ones_own_still_runs(tmp_path, monkeypatch):
     (tmp_path / "sitecustomize.py").write_text("import sys\nsys.own = 'mine'\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
