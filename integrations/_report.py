@@ -120,6 +120,11 @@ class Hook(abc.ABC):
     def _explain(self) -> str:
         """Explain why training may not have been regularized, and what to do."""
 
+    def restart(self) -> None:
+        """Forget what was counted, in a process that is a fork of the one that counted it."""
+        vars(self.tally).update(vars(Tally()))
+        self._optimized = self._idle = 0
+
     @property
     def used(self) -> bool:
         """Whether Gaussians were rendered or trained in this process."""

@@ -23,6 +23,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, chdir, contextmanager, suppress
 from importlib.util import find_spec
+from multiprocessing.util import Finalize, register_after_fork
 from pathlib import Path
 from typing import Any, get_args
 
@@ -93,7 +94,7 @@ def _launch(options: argparse.Namespace, arguments: Sequence[str], audit: Script
             given = (options.sources.root, options.outputs, options.rasterizer)
             undo.enter_context(stand_in() if options.gsplat else stand_in(*given))
         if hook is not None:
-            hook.install()
+            _install(options)
             undo.callback(_uninstall, hook)
         run_script(options.script)
 
@@ -124,17 +125,29 @@ def resume(arguments: Sequence[str], script: Sequence[str], folder: str) -> None
     undo.enter_context(old_aliases())
     atexit.register(undo.close)  # holds them until the end
     with chdir(folder):
-        hook: Hook = parse_options([*arguments, *this], in_child=True).hook
-    hook.install()
-    reports = folder_of_reports()
+        options = parse_options([*arguments, *this], in_child=True)
+    _install(options)
+    atexit.register(_leave_report, options.hook, own.name, folder_of_reports())
 
-    def report() -> None:
-        if hook.used:  # data loaders, say, render nothing
-            found = {"renders": hook.tally.as_dict(), "done": hook.tally.lines(), "problem": hook.problem()}
-            path = Path(reports, f"{os.getpid()}.json")
-            path.write_text(json.dumps({"script": own.name, **found}), encoding="utf-8")
 
-    atexit.register(report)
+def _leave_report(hook: Hook, script: str, folder: str) -> None:
+    """Report to the launcher what was done in a process that a script has started."""
+    if hook.used:  # data loaders, say, render nothing
+        found = {"renders": hook.tally.as_dict(), "done": hook.tally.lines(), "problem": hook.problem()}
+        path = Path(folder, f"{os.getpid()}.json")
+        path.write_text(json.dumps({"script": script, **found}), encoding="utf-8")
+
+
+def _install(options: argparse.Namespace) -> None:
+    """Install the hook, also in what this process forks."""
+    options.hook.install()
+    script, folder = Path(options.script).name, folder_of_reports()
+
+    def report_at_end(hook: Hook) -> None:
+        hook.restart()
+        Finalize(None, _leave_report, (hook, script, folder), exitpriority=0)  # a fork ends without atexit
+
+    register_after_fork(options.hook, report_at_end)
 
 
 def _uninstall(hook: Hook) -> None:

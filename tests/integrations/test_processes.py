@@ -44,6 +44,28 @@ def test_scripts_that_a_script_starts_are_hooked(repository, tmp_path):
 
 
 @pytest.mark.slow
+def test_what_forks_of_a_script_did_is_reported(repository, tmp_path):
+    """As of the ranks that a script forks; workers of a data loader are forks, too, and render nothing."""
+    start = """
+        import multiprocessing
+        from train import training
+
+        training(1)
+        fork = multiprocessing.get_context("fork")
+        for target, arguments in [(training, (2,)), (training, (3,)), (print, ())]:
+            process = fork.Process(target=target, args=arguments)
+            process.start()
+            process.join()
+    """
+    (repository / "both.py").write_text(textwrap.dedent(start))
+    done = run("--dropout", 0.5, "--report", tmp_path / "report.json", "both.py", cwd=repository)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["renders"]["regularized"] == 1
+    assert sorted(child["renders"]["regularized"] for child in report["started"]) == [2, 3]
+
+
+@pytest.mark.slow
 def test_relative_paths_of_the_options_hold_in_a_process_that_starts_elsewhere(repository, tmp_path):
     (tmp_path / "my_module.py").write_text("from ca_reg import GaussianDropout as Own\n")
     (tmp_path / "garden").mkdir()
