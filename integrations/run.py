@@ -120,7 +120,7 @@ def resume(arguments: Sequence[str], script: Sequence[str], folder: str) -> None
     launched one, or ``-m`` and its module. A script of this process's own takes its place.
     """
     own = Path(sys.argv[0]).absolute()
-    this = [str(own)] if own.suffix == ".py" and own.is_file() else script
+    this = [str(own)] if own.is_file() else script
     undo = ExitStack()
     undo.enter_context(old_aliases())
     atexit.register(undo.close)  # holds them until the end

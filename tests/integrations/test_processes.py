@@ -44,6 +44,20 @@ def test_scripts_that_a_script_starts_are_hooked(repository, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_command_that_a_script_starts_is_read_itself(repository, tmp_path, monkeypatch):
+    """Such as ns-train: the script that starts it does not tell what it renders with."""
+    (tmp_path / "site").mkdir()
+    (repository / "diff_gaussian_rasterization.py").rename(tmp_path / "site" / "their_rasterizer.py")
+    renderer = repository / "gaussian_renderer" / "__init__.py"
+    renderer.write_text(renderer.read_text().replace("diff_gaussian_rasterization", "their_rasterizer"))
+    (repository / "train.py").rename(repository / "their-train")
+    (repository / "all.py").write_text('import subprocess, sys\nsubprocess.run([sys.executable, "their-train", "2"])\n')
+    monkeypatch.setitem(ENVIRONMENT, "PYTHONPATH", f"{tmp_path / 'site'}{os.pathsep}{ENVIRONMENT['PYTHONPATH']}")
+    done = run("--dropout", 0.5, "all.py", cwd=repository)
+    assert re.search(r"their-train, .*: 2 renders regularized", done.stderr)
+
+
+@pytest.mark.slow
 def test_what_forks_of_a_script_did_is_reported(repository, tmp_path):
     """As of the ranks that a script forks; workers of a data loader are forks, too, and render nothing."""
     start = """
