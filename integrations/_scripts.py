@@ -93,10 +93,12 @@ def read_script(script: Path | str) -> Sources:
     """Read a script, and the files that it imports, directly or through others.
 
     They are searched in its folder, and also in the parent folder if the script mentions ``sys.path``. The script is
-    the path of a file, or the name of a module in the working directory.
+    the path of a file, or the name of a module or of a package in the working directory.
     """
     folder = script.resolve().parent if isinstance(script, Path) else Path.cwd()
-    start = script if isinstance(script, Path) else folder / f"{script.replace('.', '/')}.py"
+    start = folder.joinpath(*script.split("."), "__main__.py") if isinstance(script, str) else script
+    if isinstance(script, str) and not start.is_file():
+        start = start.parent.with_suffix(".py")
     above = start.is_file() and b"sys.path" in start.read_bytes()
     read: set[Path] = set()
     sources = Sources({script} if isinstance(script, str) else set(), root=folder)

@@ -21,6 +21,13 @@ def test_what_a_script_imports_is_read_also_through_the_files_beside_it(reposito
     assert read_script("nowhere.train").packages == {"nowhere"}
 
 
+def test_a_package_is_read_from_its_main_module_on(repository, monkeypatch):
+    (repository / "scene" / "__main__.py").write_text("from . import train\n")
+    (repository / "scene" / "train.py").write_text("from their_rasterizer import GaussianRasterizer\n")
+    monkeypatch.chdir(repository)
+    assert read_script("scene").classes == read_script("scene.train").classes == ["their_rasterizer:GaussianRasterizer"]
+
+
 @pytest.mark.parametrize("reaches_up", [False, True])
 def test_a_script_that_reaches_above_its_folder_is_read_with_what_lies_there(repository, reaches_up):
     script = repository / "scripts" / "train.py"
