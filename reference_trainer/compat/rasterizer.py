@@ -195,6 +195,7 @@ class GaussianRasterizer(nn.Module):
     """
 
     outputs: tuple[str, ...] | None = None
+    _names: tuple[str, ...] | None = None  # of the call before: one that is made again, as for a white pass, has none
 
     def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
         super().__init__()
@@ -250,7 +251,7 @@ class GaussianRasterizer(nn.Module):
                 further argument waits for a gradient of every Gaussian: zeros that require one.
         """
         settings, (n, columns) = self.raster_settings, means2D.shape
-        names = self.outputs or names_of_results()
+        names = self._names = self.outputs or names_of_results() or self._names
         kinds = kinds_of(names, {name for name in FIELDS if getattr(settings, name) is not None})
         parts = {part for kind in kinds if kind is not None for part in kind.split("+")}
         for name, value in further.items():

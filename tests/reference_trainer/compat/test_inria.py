@@ -73,7 +73,7 @@ def test_what_the_settings_ask_for_is_in_the_moments(changes, settings_of):
     """Of the stand-in with bands of which some are not active, the first one apart, and bfloat16 around it."""
     model = small_model()
     sh = torch.randn(N, 9, 3, generator=torch.Generator().manual_seed(1)) / 3
-    rasterizer = rasterizer_module("a_rasterizer", outputs=("image", "radii")).GaussianRasterizer
+    rasterizer = rasterizer_module("a_rasterizer").GaussianRasterizer
     settings = settings_of(model.camera, bg=BACKGROUND, **changes)
 
     def render(camera, gaussians, pipe, background):
