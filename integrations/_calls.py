@@ -286,9 +286,13 @@ def white_alpha(call: RasterizerCall) -> Tensor:
     finally:
         call.rasterizer.raster_settings = settings
     size = (3, settings.image_height, settings.image_width)
-    white = [x for x in returned if isinstance(x, Tensor) and tuple(x.shape) == size]
-    if len(white) != 1:
-        raise ValueError(f"the rasterizer returned {len(white)} images of shape {size} where one was expected.")
+    # Normals and coordinates (RaDe-GS) have the shape of the image, and channels that differ.
+    pictures = [x for x in returned if isinstance(x, Tensor) and tuple(x.shape) == size]
+    white = [x for x in pictures if torch.allclose(x, x[:1].expand_as(x), atol=1e-4)]
+    if not white:
+        raise ValueError(
+            f"the rasterizer returned no image of shape {size} all white: return the alpha from render, named alpha."
+        )
     return white[0].mean(0)
 
 

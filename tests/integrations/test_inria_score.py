@@ -14,7 +14,7 @@ from ca_reg import CAScore, GaussianDropout
 from ca_reg.integrations.inria import RasterizerHook, render_fn
 from reference_trainer.render import render as reference_render
 
-FORMS = ["plain", "inverse-depth", "weights", "depth-alpha"]
+FORMS = ["plain", "inverse-depth", "weights", "depth-alpha", "coordinates"]
 BACKGROUND = torch.tensor([0.3, 0.1, 0.7])
 
 

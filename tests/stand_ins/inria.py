@@ -33,7 +33,7 @@ class Settings(NamedTuple):
 
 
 def make_rasterizer(form: str = "depth-alpha") -> type[nn.Module]:
-    """Make a class that returns one of the tuples of the family: plain, inverse-depth, weights or depth-alpha."""
+    """Make a class that returns one of the tuples of the family, of which coordinates has two pictures."""
 
     class GaussianRasterizer(nn.Module):
         def __init__(self, raster_settings):
@@ -83,6 +83,7 @@ def make_rasterizer(form: str = "depth-alpha") -> type[nn.Module]:
                 "inverse-depth": (plane,),
                 "weights": (torch.ones(len(means3D), device=means3D.device),),
                 "depth-alpha": (plane, out.alpha[None]),
+                "coordinates": (plane * plane.new_tensor([1.0, 2.0, 3.0])[:, None, None],),
             }
             return (out.image, radii, *members[form])
 
