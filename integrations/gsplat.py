@@ -27,7 +27,7 @@ from ca_reg._random import seeded
 from ca_reg.decay import OpacityDecay
 
 from ._calls import Call, CallSite, Signature, chain_of
-from ._report import Hook, Tally
+from ._report import Hook, Skip, Tally
 from ._steps import FINISHED, leaves_of
 
 __all__ = [
@@ -162,7 +162,7 @@ class Regularized:
         keep = None
         if not trains:
             # What only evaluates in this process was trained before: past the end of every schedule.
-            trained = self._hook is None or self._hook.tally.regularized
+            trained = self._hook is None or self.tally.regularized or self.tally.skipped[Skip.RATE_ZERO]
             call.evaluate(self.chain, self.chain.step if trained else FINISHED, self.tally)
         else:
             if self._hook is not None:
