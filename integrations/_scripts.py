@@ -55,7 +55,7 @@ class Sources:
         found = self.packages
         for package in self.packages:
             with suppress(PackageNotFoundError):
-                found.update(re.split(r"[^\w-]", each)[0] for each in requires(package) or ())
+                found.update(re.split(r"[^\w-]", each)[0] for each in requires(package) or () if "extra ==" not in each)
         return name in found
 
     def is_own(self, module: str) -> bool:

@@ -44,6 +44,7 @@ def test_a_package_that_is_built_on_another_needs_it():
     assert Sources({"torchmetrics.image", "nowhere"}).need("torch")
     assert Sources({"gsplat"}).need("gsplat")
     assert not Sources({"torchmetrics"}).need("gsplat")
+    assert not Sources({"ca_reg"}).need("gsplat")  # an extra
 
 
 FORK = {
