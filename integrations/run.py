@@ -64,14 +64,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Exceptions of the script, SystemExit included, pass through.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    options, audit = parse_options(arguments), ScriptAudit()
+    options, audit, folder = parse_options(arguments), ScriptAudit(), os.getcwd()
     try:
         _launch(options, arguments, audit)
     except SystemExit as ended:
         if ended.code or options.guard is None:
             raise
     if options.guard is not None:
-        _guard(options, audit.saved_ply)
+        _guard(options, audit.saved_ply, folder)
 
 
 def _launch(options: argparse.Namespace, arguments: Sequence[str], audit: ScriptAudit) -> None:
@@ -99,8 +99,11 @@ def _launch(options: argparse.Namespace, arguments: Sequence[str], audit: Script
         run_script(options.script)
 
 
-def _guard(options: argparse.Namespace, saved: str | None) -> None:
-    """Write the model that the script wrote last again, without what hangs where nobody took a photograph."""
+def _guard(options: argparse.Namespace, saved: str | None, folder: str) -> None:
+    """Write the model that the script wrote last again, without what hangs where nobody took a photograph.
+
+    A regularizer of one's own is in ``folder``, which the script may have left.
+    """
     if saved is None:
         raise SystemExit("[ca_reg] ERROR: --guard: the script was not seen to write a .ply, and nothing was removed.")
     rates = [("dropout", options.dropout), ("noise", options.noise)]
@@ -108,7 +111,7 @@ def _guard(options: argparse.Namespace, saved: str | None) -> None:
     # A process of its own, in which nothing is hooked and no stand-in takes a library's place.
     command = ["-m", "reference_trainer.cli", "clean", saved, "--scene", str(options.guard), "--hanging"]
     command += ["--regularizer", " + ".join(filter(None, trained))]
-    code = subprocess.run([sys.executable, *command], check=False).returncode
+    code = subprocess.run([sys.executable, *command], cwd=folder, check=False).returncode
     if code:
         raise SystemExit(code)
 

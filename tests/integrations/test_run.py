@@ -410,7 +410,7 @@ def write_scene(folder: Path, scene: Scene) -> None:
 
 @pytest.mark.slow
 def test_a_guarded_model_is_written_again_without_what_hangs(repository, tmp_path, monkeypatch):
-    """The script writes two models and leaves its folder: the launcher cleans the later one of them."""
+    """The script writes two models and leaves its folder, with the regularizer's: the later model is cleaned."""
     scene, work = synthetic_scene(width=48, height=36, points=400), tmp_path / "work"
     write_scene(tmp_path / "scene", scene)
     start = initial_gaussians(scene, TrainConfig())
@@ -425,11 +425,13 @@ def test_a_guarded_model_is_written_again_without_what_hangs(repository, tmp_pat
     sys.exit("""
     script.write_text(script.read_text().replace("    sys.exit(", saves))
     work.mkdir()
+    (work / "my_guarded.py").write_text("from ca_reg import GaussianDropout as Own\n")
     monkeypatch.chdir(work)
-    main([str(x) for x in ("--dropout", 0.2, "--guard", tmp_path / "scene", script, 1)])
-    assert sorted(path.name for path in work.iterdir()) == ["first.ply", "last.ply", "last_clean.ply"]
+    options = ("--regularizer", "my_guarded:Own(0.1)", "--dropout", 0.2, "--guard", tmp_path / "scene")
+    main([str(x) for x in (*options, script, 1)])
+    assert sorted(path.name for path in work.glob("*.ply")) == ["first.ply", "last.ply", "last_clean.ply"]
     cleaned = load_ply(work / "last_clean.ply")
-    assert cleaned.regularizer == "dropout(0.2)"
+    assert cleaned.regularizer == "my_guarded:Own(0.1) + dropout(0.2)"
     left = {tuple(row) for row in cleaned.gaussians.means.tolist()}
     assert {tuple(row) for row in start.means.tolist()} <= left
     assert sum(tuple(row) in left for row in veil.means.tolist()) < len(beyond)
