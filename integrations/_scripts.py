@@ -232,7 +232,7 @@ def begin():
             json.dump({{"script": sys.argv[0], "renders": None, "problem": problem}}, file)
 
 
-if "{_VARIABLE}" in os.environ and "{_LAUNCHER}" not in sys.orig_argv:
+if "{_VARIABLE}" in os.environ and "{_LAUNCHER}" not in getattr(sys, "orig_argv", ()):
     sys.meta_path.insert(0, AfterTorch)
 sys.path[:] = [place for place in sys.path if os.path.abspath(place) != folder]
 hidden = sys.modules.pop("sitecustomize")

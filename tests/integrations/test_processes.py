@@ -175,12 +175,19 @@ def test_the_last_model_and_the_last_ply_are_noticed(tmp_path):
     assert (audit.saved_ply, audit.saved) == (str(tmp_path / "last.ply"), str(tmp_path / "metrics.npz"))
 
 
-@pytest.mark.parametrize("first", ["", "import importlib.util; assert importlib.util.find_spec('torch'); "])
-def test_the_first_import_of_torch_is_noticed_and_not_a_search_for_it(tmp_path, first):
+@pytest.mark.parametrize(
+    ("option", "first"),
+    [
+        ("-c", ""),
+        ("-c", "import importlib.util; assert importlib.util.find_spec('torch'); "),
+        ("-Sc", "import site, sys; del sys.orig_argv; site.main(); "),  # as before Python 3.10
+    ],
+)
+def test_the_first_import_of_torch_is_noticed_and_not_a_search_for_it(tmp_path, option, first):
     (tmp_path / "torch.py").write_text("")
     with in_children("builtins:print", "called"):
         done = subprocess.run(
-            [sys.executable, "-c", first + "import torch"], cwd=tmp_path, capture_output=True, text=True, check=True
+            [sys.executable, option, first + "import torch"], cwd=tmp_path, capture_output=True, text=True, check=True
         )
     assert done.stdout == "called\n", done.stderr
 
