@@ -33,7 +33,7 @@ class Sources:
     imports: set[str] = field(default_factory=set)
     """Dotted names of all modules, and of what may be one."""
     rasterizers: dict[str, set[str]] = field(default_factory=dict)
-    """Names ``...Rasterizer`` and ``...RasterizationSettings`` imported from foreign modules, by module."""
+    """Names ``...Rasterizer`` and ``...RasterizationSettings`` of foreign modules that are imported, by module."""
     models: list[str] = field(default_factory=list)
     """Classes with a method ``update_learning_rate(iteration)``, as ``module:Class``."""
     root: Path = Path()
@@ -74,13 +74,18 @@ class Sources:
         module = path.relative_to(folder).with_suffix("").parts if path.is_relative_to(folder) else ()
         modules = list(_imports(nodes))
         self.imports |= {_absolute(module, level, name) for level, name in modules} - {""}
+        aliases = [alias for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+        called = {alias.asname or alias.name: alias.name for alias in aliases}
         for node in nodes:
+            origin, names = "", set[str]()
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = {alias.name for alias in node.names if alias.name.endswith(_SUFFIXES)}
                 origin = _absolute(module, node.level, node.module)
-                if names and not _is_own(folder, origin):
-                    self.rasterizers.setdefault(origin, set()).update(names)
-            elif isinstance(node, ast.ClassDef) and module and not main:
+            elif isinstance(node, ast.Attribute) and node.attr.endswith(_SUFFIXES):
+                origin, names = called.get(ast.unparse(node.value), ""), {node.attr}
+            if origin and names and not _is_own(folder, origin):
+                self.rasterizers.setdefault(origin, set()).update(names)
+            if isinstance(node, ast.ClassDef) and module and not main:
                 methods = {part.name: part.args for part in node.body if isinstance(part, ast.FunctionDef)}
                 arguments = methods.get("update_learning_rate")
                 # Without an argument it may be a scheduler's, called for anything but a step of a model.

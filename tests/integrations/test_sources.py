@@ -126,6 +126,18 @@ def test_the_sources_of_extensions_and_hidden_folders_are_not_read(repository):
     assert read_folder(repository).models == ["scene.gaussian_model:GaussianModel"]
 
 
+def test_a_rasterizer_is_also_found_as_an_attribute_of_its_module(repository):
+    (repository / "dotted.py").write_text(
+        "import diff_first, far.diff_second, diff_third as r, scene, torch\n"
+        "diff_first.GaussianRasterizer(diff_first.GaussianRasterizationSettings(scene.GaussianRasterizer))\n"
+        "def late():\n    far.diff_second.GaussianRasterizer(torch.Tensor)\n    r.Own.render(r.SurfelRasterizer)\n"
+    )
+    classes = ["diff_first:GaussianRasterizer", "far.diff_second:GaussianRasterizer", "diff_third:SurfelRasterizer"]
+    found = read_script(repository / "dotted.py")
+    assert sorted(found.classes) == sorted(classes)
+    assert found.rasterizers["diff_first"] == {"GaussianRasterizer", "GaussianRasterizationSettings"}
+
+
 def test_rasterizers_within_packages_are_extensions_if_they_are_compiled(repository):
     """Under a dotted name, with their Python half in the repository (RAIN-GS) or built into its package."""
     halves = {"from ..setup import _C": "a", "from . import _C": "b", "import torch": "own"}
