@@ -23,6 +23,7 @@ from unittest.mock import patch
 from ._patching import AfterImport
 
 _SUFFIXES = ("Rasterizer", "RasterizationSettings")
+_OF_MESHES = "pytorch3d"  # the package whose rasterizers, of meshes and points, have such names, too
 _NOT_READ = {"submodules", "build", "site-packages"}  # extensions and environments within a repository
 
 
@@ -83,7 +84,7 @@ class Sources:
                 origin = _absolute(module, node.level, node.module)
             elif isinstance(node, ast.Attribute) and node.attr.endswith(_SUFFIXES):
                 origin, names = called.get(ast.unparse(node.value), ""), {node.attr}
-            if origin and names and not _is_own(folder, origin):
+            if origin and names and origin.partition(".")[0] != _OF_MESHES and not _is_own(folder, origin):
                 self.rasterizers.setdefault(origin, set()).update(names)
             if isinstance(node, ast.ClassDef) and module and not main:
                 methods = {part.name: part.args for part in node.body if isinstance(part, ast.FunctionDef)}

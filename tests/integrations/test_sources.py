@@ -138,6 +138,13 @@ def test_a_rasterizer_is_also_found_as_an_attribute_of_its_module(repository):
     assert found.rasterizers["diff_first"] == {"GaussianRasterizer", "GaussianRasterizationSettings"}
 
 
+def test_rasterizers_of_meshes_are_left_alone(repository):
+    """As SuGaR has them, and avatars that gsplat renders."""
+    line = "from pytorch3d.renderer.mesh import MeshRasterizer, RasterizationSettings\n"
+    (repository / "avatar.py").write_text(line + "import gsplat, pytorch3d.renderer as p\np.PointsRasterizer()\n")
+    assert read_script(repository / "avatar.py").rasterizers == {}
+
+
 def test_rasterizers_within_packages_are_extensions_if_they_are_compiled(repository):
     """Under a dotted name, with their Python half in the repository (RAIN-GS) or built into its package."""
     halves = {"from ..setup import _C": "a", "from . import _C": "b", "import torch": "own"}
