@@ -94,6 +94,8 @@ class GsplatModel:
         are those of :meth:`render`.
         """
         gsplat = load_gsplat(self.means.device)
+        if "opacities" not in inspect.signature(gsplat.fully_fused_projection).parameters:
+            raise ImportError("lists need gsplat 1.5 or newer; with Triton there is GsplatMoments(model.rasterized).")
         flat = opacity.reshape(-1)
         if not len(flat):  # which not every gsplat can list
             none = flat.long()

@@ -170,6 +170,13 @@ def test_the_arguments_are_those_of_the_package():
         assert {before.get(argument, argument) for argument in ours} <= theirs.keys()
 
 
+def test_lists_of_an_older_gsplat_are_refused(package, monkeypatch):
+    monkeypatch.setattr(package, "fully_fused_projection", lambda means, quats, calc_compensations: None)  # 1.4
+    model, view = model_of(random_scene(3, WIDTH, HEIGHT, seed=0))
+    with pytest.raises(ImportError, match=r"gsplat 1\.5"):
+        model.lists(torch.ones(3), view)
+
+
 def test_a_cpu_is_refused():
     model, view = model_of(random_scene(3, WIDTH, HEIGHT, seed=0))
     for method in (model.render, model.rasterized, model.lists):
