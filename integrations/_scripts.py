@@ -98,8 +98,8 @@ class Sources:
 def read_script(script: Path | str) -> Sources:
     """Read a script, and the files that it imports, directly or through others.
 
-    They are searched in its folder, and also in the parent folder if the script mentions ``sys.path``. The script is
-    the path of a file, or the name of a module or of a package in the working directory.
+    They are searched in its folder, and also in the parent folder if the script mentions ``sys.path``; gsplat is not
+    read. The script is the path of a file, or the name of a module or of a package in the working directory.
     """
     folder = script.resolve().parent if isinstance(script, Path) else Path.cwd()
     start = folder.joinpath(*script.split("."), "__main__.py") if isinstance(script, str) else script
@@ -117,6 +117,8 @@ def read_script(script: Path | str) -> Sources:
         read.add(path)
         sources.root = min(sources.root, origin)
         for level, name in sources.read(path, origin, main=path == start.resolve()):
+            if name.partition(".")[0] == "gsplat":  # its wrappers of INRIA's rasterizers are not the script's
+                continue
             for place in (folder, folder.parent)[: 1 + above] if level == 0 else (path.parents[level - 1],):
                 module = place.joinpath(*name.split("."))
                 files += [

@@ -145,6 +145,16 @@ def test_rasterizers_of_meshes_are_left_alone(repository):
     assert read_script(repository / "avatar.py").rasterizers == {}
 
 
+def test_a_gsplat_beside_the_script_does_not_make_it_one_of_the_inria_family(repository):
+    """As beside the trainers in its repository: it wraps their rasterizers for comparisons."""
+    (repository / "gsplat").mkdir()
+    (repository / "gsplat" / "__init__.py").write_text("from .rendering import rasterization\n")
+    (repository / "gsplat" / "rendering.py").write_text("from diff_surfel import GaussianRasterizer\n")
+    (repository / "trainer.py").write_text("from gsplat.rendering import rasterization\n")
+    sources = read_script(repository / "trainer.py")
+    assert (sources.packages, sources.classes) == ({"gsplat"}, [])
+
+
 def test_rasterizers_within_packages_are_extensions_if_they_are_compiled(repository):
     """Under a dotted name, with their Python half in the repository (RAIN-GS) or built into its package."""
     halves = {"from ..setup import _C": "a", "from . import _C": "b", "import torch": "own"}
