@@ -168,9 +168,9 @@ def compute_relocation(
 ) -> tuple[Tensor, Tensor]:
     """Return opacities and scales with which n Gaussians at one place look like one (3DGS-MCMC, equation 9).
 
-    Opacities (N,) and scales (N, 3) are those of the one; ``ratios`` (N,) holds n, clamped to the size of ``binoms``,
-    whose row n and column k is n choose k. New opacities are at least ``min_opacity``, and the scales account for it
-    (gsplat 1.6).
+    Opacities (N,) or (N, 1) and scales (N, 3) are those of the one; ``ratios`` (N,) holds n, clamped to the size of
+    ``binoms``, whose row n and column k is n choose k. New opacities are at least ``min_opacity``, and the scales
+    account for it (gsplat 1.6).
 
     Example:
         >>> table = torch.tensor([[1.0, 0.0], [1.0, 1.0]])
@@ -179,11 +179,12 @@ def compute_relocation(
         (0.5, 0.9111)
     """
     n = ratios.long().clamp(1, len(binoms))
+    old = opacities.double().flatten()
     # n layers let as much light pass as the one: (1 - new)^n = 1 - old.
-    opacity = (1 - (1 - opacities.double()) ** (1 / n.double())).clamp_min(min_opacity)
+    opacity = (1 - (1 - old) ** (1 / n.double())).clamp_min(min_opacity)
     k = torch.arange(len(binoms), dtype=torch.float64, device=binoms.device)
     # The scales shrink by old / sum_i<n sum_k C(i, k) (-1)^k new^(k + 1) / sqrt(k + 1); the sum over i is the cumsum.
     # The signs of the terms alternate: in single precision they would cancel.
     terms = binoms.double().cumsum(0) * (-1) ** k / (k + 1).sqrt()
-    shrink = opacities.double() / (terms[n - 1] * opacity[:, None] ** (k + 1)).sum(1)
-    return opacity.to(opacities), scales * shrink[:, None].to(scales)
+    shrink = old / (terms[n - 1] * opacity[:, None] ** (k + 1)).sum(1)
+    return opacity.to(opacities).view_as(opacities), scales * shrink[:, None].to(scales)

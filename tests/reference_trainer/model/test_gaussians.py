@@ -104,3 +104,6 @@ def test_relocation_is_equation_9(min_opacity):
         )
         assert found[0][i].item() == pytest.approx(new, rel=1e-6)
         torch.testing.assert_close(found[1][i], scales[i] * (o / shrink), rtol=1e-5, atol=0)
+    column, same = compute_relocation(opacities[:, None], scales, ratios, table, min_opacity)  # splatfacto's
+    assert torch.equal(column, found[0][:, None])
+    assert torch.equal(same, found[1])
