@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -32,8 +33,6 @@ NVIDIA_SMI = """#!/bin/sh
 printf 'GPU 00000000:00:00.0\\n    FB Memory Usage\\n'
 for line in Total Reserved Used Free; do printf '        %s : 0 MiB\\n' $line; done
 """
-
-_in_child = ExitStack()
 
 
 @contextmanager
@@ -78,7 +77,9 @@ def stand_in(
 
 def install_in_child(repository: str | None, outputs: Sequence[str] | None, rasterizer: str | None) -> None:
     """Install the stand-ins, with the arguments of `stand_in`, in a process that was started with them."""
-    _in_child.enter_context(_installed(repository, outputs, rasterizer))
+    undo = ExitStack()
+    undo.enter_context(_installed(repository, outputs, rasterizer))
+    atexit.register(undo.close)  # holds them until the end
 
 
 @contextmanager
