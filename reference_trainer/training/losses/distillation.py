@@ -62,6 +62,7 @@ class Distillation(WeightedTerm):
         if not self.members:
             raise ValueError("distillation needs .ply files of models to learn from, best two: distillation('a.ply').")
         self.views = unseen_views(scene)
+        self._brightest = max(1.0, *(view.image.max().item() for view in scene.train))  # over 1 by an exposure
 
     def value(self, step: Step) -> Tensor:
         """Compare the model with the mean of the members at one camera."""
@@ -83,7 +84,7 @@ class Distillation(WeightedTerm):
             shown = torch.stack([torch.cat([each.image, 1 - each.alpha[None]]) for each in of_all]).mean(dim=0)
             if len(self._shown) < _KEPT:
                 self._shown[number] = shown
-        return (shown[:3] + shown[3] * background[:, None, None]).clamp(0, 1)
+        return (shown[:3] + shown[3] * background[:, None, None]).clamp(0, self._brightest)
 
 
 def _member(path: str, black: Tensor) -> TrainedModel:

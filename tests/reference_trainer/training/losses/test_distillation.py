@@ -88,6 +88,18 @@ def test_what_the_members_show_at_a_camera_is_rendered_once_for_all_backgrounds(
     assert over_green == value(new_term(), 0, green) != values[0]
 
 
+def test_a_model_as_bright_as_photographs_over_1_has_nothing_to_learn_from_itself(scene, six, take_step, tmp_path):
+    """Photographs that were made equally bright reach over 1, and so do the models of them."""
+    bright, path = dataclasses.replace(six, sh_dc=six.sh_dc + 4).map(torch.Tensor.float), tmp_path / "bright.ply"
+    save_ply(bright, path)
+    raw = {name: x.double() for name, x in bright.named()}
+    assert take_step(**raw).image.max() > 1.1
+    scene = dataclasses.replace(scene, train=tuple(dataclasses.replace(v, image=v.image / 0.4) for v in scene.train))
+    (term,) = LOSSES.make(f"distillation({str(path)!r})")
+    term.begin(scene)
+    assert term(take_step(**raw)) < 1e-6
+
+
 def test_density_control_does_not_see_it(scene, take_step, members):
     (term,) = LOSSES.make(f"distillation({members[0][0]!r})")
     term.begin(scene)
