@@ -55,7 +55,8 @@ class AdaptiveDensity(DensityStrategy):
             self.densify(optimizer, step)
             if len(optimizer.gaussians) == 0:
                 raise TrainingStoppedError(
-                    f"all Gaussians were pruned after step {step}: lower prune_opacity or noise, raise opacity_reset."
+                    f"all Gaussians were pruned after step {step}: lower prune_opacity or noise, or raise "
+                    "opacity_reset, opacity_decay or prune_size."
                 )
             # Sums over the old set mean nothing for the new one.
             self.reset(len(optimizer.gaussians))

@@ -198,10 +198,18 @@ def test_a_loss_that_is_not_finite_stops_before_it_does_harm(tiny_scene, value):
     assert all(torch.isfinite(x).all() and x.grad is None for _, x in trainer.gaussians.named())
 
 
-def test_a_model_without_gaussians_stops(tiny_scene):
-    config = TrainConfig(iterations=9, densify_from=1, densify_every=2, prune_opacity=0.99)
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"prune_opacity": 0.99}, "prune_opacity"),
+        ({"prune_size": 1e-6, "prune_size_from": 0}, "prune_size"),
+        ({"opacity_decay": 0.01}, "opacity_decay"),
+    ],
+)
+def test_a_model_without_gaussians_stops(tiny_scene, settings, named):
+    config = TrainConfig(iterations=9, densify_from=1, densify_every=2, **settings)
     trainer = Trainer(tiny_scene, config)
-    with pytest.raises(TrainingStoppedError, match="pruned after step 2"):
+    with pytest.raises(TrainingStoppedError, match=f"pruned after step 2: .*{named}"):
         trainer.train()
 
 
