@@ -107,7 +107,7 @@ def save_ply(
     elif bake_p:
         # The decimal of 1 - 0.2 is written, not the neighboring double that the subtraction gives.
         factor = torch.tensor(1 - bake_p, dtype=torch.float64)
-        logits, comments = _scaled_logits(logits, factor), [f"comment {_SCALED} {round(1 - bake_p, 12)}"]
+        logits, comments = _scaled_logits(logits, factor), [f"comment {_SCALED} {1 - bake_p:.12g}"]
     if regularizer:
         comments.append(f"comment {_TRAINED_WITH} {step} {' '.join(regularizer.split())}")
     n, rest = len(gaussians), gaussians.sh_rest.detach().transpose(1, 2)  # [N, 3, K]

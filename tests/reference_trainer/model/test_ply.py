@@ -92,7 +92,7 @@ def test_padding_to_a_higher_degree(tmp_path):
     assert load_ply(tmp_path / "b.ply").gaussians.sh_degree == 2
 
 
-@pytest.mark.parametrize("p", [0.2, 0.5, 0.999])
+@pytest.mark.parametrize("p", [0.2, 0.5, 0.999, 1 - 1e-13])
 def test_baked_opacities(tmp_path, p):
     gaussians = make(50)
     save_ply(gaussians, tmp_path / "a.ply", bake_p=p)
