@@ -101,9 +101,12 @@ def make_plan(
     if unknown := set(given) - {f.name for f in dataclasses.fields(TrainConfig)}:
         raise ValueError(f"given must name fields of TrainConfig, got {sorted(unknown)}.")
     check(config)
-    fixed = _fixed(config, given)
-    rules = (partial(rule, device=device) if rule is unseen else rule for rule in RULES)  # the one that renders
-    return Plan(tuple(_item(rule(scene, config), config, fixed) for rule in rules))
+    fixed, items = _fixed(config, given), list[PlanItem]()
+    for each in RULES:
+        rule = partial(each, device=device) if each is unseen else each  # the one that renders
+        items.append(_item(rule(scene, config), config, fixed))
+        config = dataclasses.replace(config, **items[-1].changes)  # what is left out depends on the size
+    return Plan(tuple(items))
 
 
 def _fixed(config: TrainConfig, given: Collection[str]) -> set[str]:

@@ -315,10 +315,10 @@ SPARSE_GAINS_FAR_APART = {"DTU scan24": (1.0, 2.4), "DTU scan65": (-1.2, 2.3), "
 
 RULES: tuple[Callable[[Scene, TrainConfig], PlanItem], ...] = (
     sh_bands, alpha_masks, background, depth_output, distortion, densification, opacity_reset, dropout, dropped,
-    guarding, regularizer_inputs, unseen, saturated, ssim_windows, moments, initial_size, dense_start,
+    guarding, regularizer_inputs, initial_size, unseen, saturated, ssim_windows, moments, dense_start,
     one_exposure,
 )  # fmt: skip
-"""All rules, in the order of the table."""
+"""All rules, in the order of the table; each is given the settings with what those before it have changed."""
 
 
 def _degrees_apart(scene: Scene) -> float:

@@ -105,6 +105,19 @@ def test_points_behind_all_cameras_are_left_out(tiny_scene):
     assert not items(model, TrainConfig())[rule].changes  # a model is trained on as it is
 
 
+@pytest.mark.parametrize("given", [(), ("initial_scale",)])
+def test_those_left_out_have_no_pixel_at_the_size_that_they_start_with(tiny_scene, given):
+    """Random points start half as wide, unless a size was asked for."""
+    positions = tiny_scene.points.positions
+    scattered = positions.mean(0) + 3 * (positions - positions.mean(0))
+    random = PointCloud(scattered, tiny_scene.points.colors, "random")
+    scene = dataclasses.replace(tiny_scene, points=random)
+    plan = make_plan(scene, TrainConfig(), given=given)
+    left = len(positions) - len(initial_gaussians(scene, plan.applied(TrainConfig(), given=given)))
+    told = next(item.reason for item in plan.items if item.changes.get("initial_points") == "seen")
+    assert told.startswith(f"{left} of {len(positions)} ")
+
+
 @pytest.mark.parametrize(
     ("name", "config", "said"),
     [
