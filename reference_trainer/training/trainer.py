@@ -20,7 +20,7 @@ from reference_trainer.evaluation.trained_model import TrainedModel
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.progress import progress_bar
 from reference_trainer.render import NotFiniteError
-from reference_trainer.scenes.scene import Scene
+from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.assembly import (
     check,
     draws_background,
@@ -89,7 +89,7 @@ class Trainer:
         self.seconds = self.processor_seconds = 0.0
         self.loss = math.nan
         self.removed: tuple[TrainedModel, Guard] | None = None
-        self._shown: tuple[Tensor, Tensor] | None = None  # the last render, and its photograph
+        self._shown: tuple[Tensor, View] | None = None  # the last render, and its view
         self.views = [view.to(self.device) for view in scene.train]
         self.background = scene.background.to(self.device)
         self._draws_background = draws_background(config, scene)
@@ -167,8 +167,8 @@ class Trainer:
         """Mean squared error of the first model's (regularized) render in the last step; nan before the first."""
         if self._shown is None:
             return math.nan
-        image, photograph = self._shown
-        return torch.nn.functional.mse_loss(image.clamp(0, 1), photograph).item()
+        image, view = self._shown
+        return torch.nn.functional.mse_loss(view.as_taken(image).clamp(0, 1), view.as_taken(view.image)).item()
 
     def train_step(self) -> float:
         """Take one step on one view; return the loss, of all models together."""
@@ -204,7 +204,7 @@ class Trainer:
                 model.optimizer.step()
         self.step += 1
         self.loss = value
-        self._shown = steps[0].image.detach(), steps[0].view.image
+        self._shown = steps[0].image.detach(), steps[0].view
         self.removed = None
         if self._guards:
             self._guard()

@@ -149,6 +149,20 @@ def test_the_loss_of_a_step_is_that_of_the_view_it_renders(tiny_scene):
     assert found in [pytest.approx(pair, rel=1e-5) for pair in pairs]
 
 
+def test_the_squared_error_of_photographs_of_one_exposure_is_that_of_what_was_taken(tiny_scene):
+    """Divided, they reach over 1, up to which renders are clamped."""
+    taken, exposure = tiny_scene.train[0], torch.tensor([0.5, 0.6, 0.7])
+    divided = dataclasses.replace(taken, image=taken.image / exposure[:, None, None], exposure=exposure)
+    trainer = Trainer(dataclasses.replace(tiny_scene, train=(divided,)), TrainConfig(iterations=1, sh_degree=0))
+    with torch.no_grad():
+        trainer.gaussians.sh_dc.add_(4)
+    image = render_gaussians(trainer.gaussians, taken.camera, tiny_scene.background).image.detach()
+    assert (image > 1).any()
+    trainer.train()
+    expected = ((image * exposure[:, None, None]).clamp(0, 1) - taken.image).square().mean().item()
+    assert trainer.mse == pytest.approx(expected, rel=1e-4)
+
+
 # Randomness
 
 
