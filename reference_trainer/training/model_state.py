@@ -137,7 +137,7 @@ class ModelState(Generic[D]):
         self.regularizer = regularizer
         learns, start = regularizer.learns, initial_gaussians(scene, config, device)
         known = start.learned  # of a model with the same regularizers
-        learned = {name: known.get(name, torch.full((len(start),), x.start)) for name, x in learns.items()}
+        learned = {name: known.get(name, torch.full((len(start),), float(x.start))) for name, x in learns.items()}
         start = replace(start, learned=learned)
         # The means move in the world's units, everything else in units of its own.
         rates = {

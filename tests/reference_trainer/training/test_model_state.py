@@ -2,20 +2,23 @@
 
 import dataclasses
 import gc
+from typing import ClassVar
 
 import pytest
 import torch
 from stand_ins.card import CARD, pretended_card
 
+from ca_reg import Chain, GaussianDropout
+from ca_reg.regularizer import Learned
 from reference_trainer.camera import Camera
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.runs.run import model_of
 from reference_trainer.scenes.scene import PointCloud, Scene, View
 from reference_trainer.training import model_state
-from reference_trainer.training.assembly import check
+from reference_trainer.training.assembly import check, make_density
 from reference_trainer.training.checkpoint import load_checkpoint, save_checkpoint
 from reference_trainer.training.config import TrainConfig
-from reference_trainer.training.model_state import initial_gaussians, seen_by_any
+from reference_trainer.training.model_state import ModelState, initial_gaussians, seen_by_any
 from reference_trainer.training.plan import make_plan
 from reference_trainer.training.step import Step
 from reference_trainer.training.trainer import Trainer
@@ -97,6 +100,18 @@ def test_no_point_in_view_says_what_to_do(tiny_scene):
     scene = dataclasses.replace(tiny_scene, points=points, train=(View("a", camera(), torch.zeros(3, 24, 32)),))
     with pytest.raises(ValueError, match=r"no initial Gaussian .*training view"):
         initial_gaussians(scene, TrainConfig(initial_points="seen"))
+
+
+class Learning(GaussianDropout):
+    """Learns a number whose start is whole."""
+
+    learns: ClassVar[dict[str, Learned]] = {"numbers": Learned(2, 0.1)}
+
+
+def test_what_is_learned_may_start_at_a_whole_number(tiny_scene):
+    config = TrainConfig()
+    gaussians = ModelState(tiny_scene, config, make_density(config), Chain(Learning(0.2))).gaussians
+    assert torch.equal(gaussians.learned["numbers"].detach(), torch.full((150,), 2.0))
 
 
 SEGS = "self_ensembling(1.0, every=3, start=6, stop=20, views=2)"
