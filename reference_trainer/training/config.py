@@ -20,7 +20,8 @@ class TrainConfig:
     Steps at which something begins are those of the recipe's own 10,000; `with_recipe` scales them, as commands do.
 
     Raises:
-        TypeError: if a number of steps, models, Gaussians or bands, or the seed, is no integer, or another number none.
+        TypeError: if a number of steps, models, Gaussians or bands, or the seed, is no integer, or another setting of
+            another type.
         ValueError: if a setting is out of range, or two contradict each other.
     """
 
@@ -124,6 +125,8 @@ class TrainConfig:
                 raise TypeError(f"{name} must be an integer, got {value!r}: convert it with int().")
             if kind == "float" and (isinstance(value, bool) or not isinstance(value, int | float)):
                 raise TypeError(f"{name} must be a number of Python's, got {value!r}: convert it with float().")
+            if kind in ("str", "bool") and not isinstance(value, str if kind == "str" else bool):
+                raise TypeError(f"{name} must be a {kind} of Python's, got {value!r}.")
         for names, right, rule, hint in _RANGES:
             for name in names:
                 if not right(getattr(self, name)):

@@ -106,6 +106,16 @@ def test_rates_are_numbers_that_a_checkpoint_can_hold(field, value):
         TrainConfig(**{field: value})
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("analytic", np.bool_(True)), ("opacity_reset_over_white", 1), ("regularizer", None), ("loss", ["photometric"])],
+)
+def test_switches_and_expressions_are_those_that_a_checkpoint_can_hold(field, value):
+    """JSON knows no bool of NumPy: the training had run when its checkpoint could not be written."""
+    with pytest.raises(TypeError, match=f"{field} must be"):
+        TrainConfig(**{"dropout": 0.2, field: value})
+
+
 def test_a_rate_of_numpy_is_written_like_one_of_python():
     config = TrainConfig(dropout=np.linspace(0.0, 0.4, 5)[1], noise=np.float64(1e-5))
     assert config.regularizers == "dropout(0.1) + noise(1e-05)"
