@@ -110,13 +110,15 @@ def find_poses(
         ImportError: if pycolmap is missing.
         FileNotFoundError: if there is no such folder.
         ValueError: if it holds fewer than two photographs that can be read, they show too little in common for any
-            camera, or there is no such camera model.
+            camera, or there is no such camera model or seed.
         FileExistsError: if the scene has cameras already, or another photograph of a name.
         OSError: if it cannot be written.
     """
     known = [model.name for model in CAMERA_MODELS]
     if camera is not None and camera not in known:
         raise ValueError(f"there is no camera model {camera!r}; choose one of {', '.join(known)}.")
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"COLMAP's seed must be in [0, 2^32), got {seed}.")
     scene = Path(scene)
     out = scene if out is None else Path(out)
     folder = photograph_folder(scene)

@@ -114,6 +114,14 @@ def test_an_unknown_camera_model_is_answered_with_those_that_there_are(noise):
         find_poses(noise, camera="opencv")
 
 
+@pytest.mark.parametrize("seed", [-1, 2**32])
+def test_a_seed_that_colmap_cannot_take(noise, seed, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["poses", str(noise), "--seed", str(seed)])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.endswith(f"got {seed}.\n")
+
+
 def test_without_pycolmap(noise, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(SystemExit) as stop:
