@@ -15,7 +15,7 @@ from reference_trainer.evaluation.evaluate import Evaluation, evaluate
 from reference_trainer.evaluation.shares import Heat, all_but_highest, guard
 from reference_trainer.evaluation.tables import QUANTITIES, markdown_table
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.files import replacing
+from reference_trainer.files import is_ply, replacing
 from reference_trainer.model.ply import save_ply
 from reference_trainer.runs.folder import check_writable
 from reference_trainer.runs.ply import load_for_views, load_plain_ply_model, load_ply_model, log_other_frame, scaled
@@ -44,7 +44,7 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None, trus
 
     Raises:
         ValueError: if the regularizers are unknown or cannot be parsed, the test-time opacities are the plain ones or
-            depend on the camera, or those of the source are test-time ones already.
+            depend on the camera, those of the source are test-time ones already, or the target is no .ply.
         FileExistsError: if the target exists: plain opacities are needed to train on and are never overwritten.
         FileNotFoundError: if there is no source.
 
@@ -63,6 +63,8 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None, trus
     """
     if target.exists():
         raise FileExistsError(f"{target} exists already: give another --out, or delete it.")
+    if not is_ply(target):
+        raise ValueError(f"{target} must end in .ply, {' or '.join(SMALL)}.")
     model, facts = load_plain_ply_model(source, regularizer=regularizer, trust=trust)
     if not facts.regularizer:
         raise ValueError(f"{source} does not say what it was trained with: give --regularizer, such as 'dropout(0.2)'.")
@@ -134,7 +136,7 @@ def clean_ply(
     Raises:
         ValueError: as `score_ply`, if ``fraction`` or ``refine`` is out of range, no view has a score, the PLY has
             only test-time opacities, which cannot be trained, the model was trained with dropout, or with ``hanging``
-            without a regularizer, or there is no scene.
+            without a regularizer, there is no scene, or ``out`` is no .ply.
         FileExistsError: if ``out`` exists.
         FileNotFoundError: if the PLY or the scene is missing.
     """
@@ -143,8 +145,8 @@ def clean_ply(
         raise ValueError(f"fraction must be in (0, 1) and refine at least 0, got {fraction} and {refine}.")
     if out.exists():
         raise FileExistsError(f"{out} exists already: give another --out, or delete it.")
-    if out.suffix.lower() in SMALL:
-        raise ValueError(f"a cleaned model is a PLY: clean to {out.with_suffix('.ply')}, and bake that to {out.name}.")
+    if not is_ply(out):
+        raise ValueError(f"a cleaned model is a PLY: clean to {out.with_suffix('.ply')}, and bake that for others.")
     check_writable(out.parent)
     loaded = load_for_views(ply, where, background=background, regularizer=regularizer, device=device, trust=trust)
     model, scene = loaded.model, loaded.scene

@@ -239,7 +239,9 @@ def test_what_would_be_lost_is_refused(trained, capsys, tmp_path):
     assert "is a folder" in refused(["plan", "--out", garden], capsys)
     assert "holds plan.json" in refused(["train", "--out", garden, *SMALL], capsys)
     assert "which knows no cameras" in refused(["render", str(trained / "point_cloud.ply")], capsys)
-    assert "bake that" in refused(["clean", str(trained / "point_cloud.ply"), "--anyway", "--out", "x.spz"], capsys)
+    for other in (f"{garden}/x.spz", f"{garden}/x.splat"):
+        assert "bake that" in refused(["clean", str(trained / "point_cloud.ply"), "--anyway", "--out", other], capsys)
+    assert "end in .ply" in refused(["bake", str(trained / "point_cloud.ply"), "--out", f"{garden}/x.splat"], capsys)
     (tmp_path / "evaluation.json").write_text("{}")
     assert "holds evaluation.json" in refused(["evaluate", str(trained), "--out", garden], capsys)
     assert "holds test_0.png" in refused(["render", str(trained), "--what", "test", "--out", garden], capsys)
