@@ -296,7 +296,10 @@ class Clean:
 
     def check(self) -> None:
         options.check_ply(self.ply)
-        options.check_model(self.ply, scene_or_orbit(self.ply, self.scene, self.orbit))
+        where = scene_or_orbit(self.ply, self.scene, self.orbit)
+        if self.refine and isinstance(where, OrbitOptions):
+            raise ValueError(f"--refine {self.refine} needs photographs: give --scene FOLDER.")
+        options.check_model(self.ply, where)
 
     def __call__(self) -> None:
         from reference_trainer.runs.edit_ply import clean_ply
