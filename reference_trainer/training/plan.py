@@ -55,7 +55,7 @@ class Plan:
             raise ValueError(f"expected a plan (plan.json of a run), got other data: {error}.") from error
 
     def summary(self) -> str:
-        """Return what matters in a few lines: what changes, whether dropout is recommended, and what else.
+        """Return what matters in a few lines: what changes, whether dropout is recommended, and what else can be had.
 
         Example:
             >>> print(Plan((PlanItem("SH bands", "reduced", "the others would stay 0", {"sh_degree": 0}),)).summary())
@@ -66,8 +66,9 @@ class Plan:
         what = f"{len(changes)} setting{'s' * (len(changes) != 1)}: {'; '.join(changes)}" if changes else "no setting"
         dropout = [f"Dropout is {item.decision}: {item.reason}." for item in self.items if item.name == "dropout"]
         others = [item for item in self.items if item.decision == "recommended" and item.name != "dropout"]
-        recommended = [f"Recommended, {item.name}: {item.reason}." for item in others]
-        return "\n".join([f"Training changes {what}.", *dropout, *recommended])
+        others += [item for item in self.items if item.decision == "left out" and " --" in item.reason]  # by an option
+        told = [f"{item.decision.capitalize()}, {item.name}: {item.reason}." for item in others]
+        return "\n".join([f"Training changes {what}.", *dropout, *told])
 
     def rows(self) -> list[dict[str, object]]:
         """Return one row per item, for a table with the columns item, decision, change and reason."""

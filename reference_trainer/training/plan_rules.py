@@ -273,11 +273,13 @@ def one_exposure(scene: Scene, config: TrainConfig) -> PlanItem:
     name = "one exposure"
     if any(view.exposure is not None for view in scene.train):
         return PlanItem(name, "used", "asked for, and photographs differ")
+    if len(scene.train) > FEW:  # the time goes by the pairs
+        return PlanItem(name, "left out", f"not looked for among more than {FEW} photographs")
     factors = exposures(scene.train, scene.points.positions)
     if factors is None:
         return PlanItem(name, "left out", "no photograph is brighter than another by more than shading")
-    gains = ", ".join(f"{gain:+.1f} on {scene}" for scene, gain in ONE_EXPOSURE_GAINS.items())
-    return PlanItem(name, "left out", f"{difference(factors)}: --one-exposure undoes that, which gained {gains} dB")
+    gains = ", ".join(f"{gain:+.1f} dB on {scene}" for scene, gain in ONE_EXPOSURE_GAINS.items())
+    return PlanItem(name, "left out", f"{difference(factors)}: --one-exposure undoes that, which gained {gains}")
 
 
 DENSE_GAINS = {"fern": 1.9, "herz-jesu": 1.0, "fountain": 0.7, "sceaux": 0.4, "cape": 0.3}

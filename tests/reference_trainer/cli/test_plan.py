@@ -37,15 +37,16 @@ def test_plan_prints_every_item_and_writes_it(capsys, tmp_path):
 
 
 def test_plan_says_in_a_few_lines_what_matters(capsys):
-    """Pictures, views, what changes, and whether dropout is recommended, with losses where some were measured."""
+    """Pictures, views, changes, whether dropout is recommended, with losses where some were measured, and an option."""
     main(["plan", "synthetic", "--downscale", "8"])
-    photographs, train, test, changes, dropout = capsys.readouterr().out.splitlines()
+    photographs, train, test, changes, dropout, start = capsys.readouterr().out.splitlines()
     assert photographs.endswith("20x15 pixels")
     assert train == "3 training views: train_0, train_1, train_2"
     assert test == "3 test views: test_0, test_1, test_outside"
     assert changes.startswith("Training changes ")
     assert changes.endswith("--verbose")
     assert re.search(r"^Dropout is .*; 3 views, .* [-+]\d\.\d to [-+]\d\.\d dB", dropout)
+    assert "--points dense" in start
 
 
 def test_the_scene_may_be_given_either_way(monkeypatch, tmp_path):

@@ -87,6 +87,7 @@ def test_the_plan_tells_where_photographs_differ(scene, uneven):
 
     assert "--one-exposure" not in decided(scene.train).reason
     assert "50 %: --one-exposure" in decided(uneven).reason
+    assert "--one-exposure" not in decided(uneven * 4).reason  # twelve: the time goes by the pairs
     assert decided(with_one_exposure(uneven, (), scene.points.positions)[0]).decision == "used"
 
 
