@@ -5,12 +5,25 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 
 import pytest
 
 from benchmarks import setting
-from benchmarks.choices import BY_DEFAULT, CHOICES, SLOWER_MEANS, from_same_start, gains_of, tables
+from benchmarks.choices import (
+    BY_DEFAULT,
+    CHOICES,
+    EVEN,
+    SLOWER_MEANS,
+    UNEVEN,
+    from_same_start,
+    gains_of,
+    pairs_of,
+    tables,
+)
+from benchmarks.start_scenes import from_today
 from benchmarks.tests.test_setting import row
+from reference_trainer.training.plan_rules import ONE_EXPOSURE_GAINS
 
 
 def test_a_candidate_of_the_later_choices_gains_with_the_start_of_the_recipe():
@@ -68,3 +81,11 @@ def test_the_page_has_the_tables_of_its_rows(name):
     rows = json.loads((setting.REFERENCES.parent / name).read_text("utf-8"))
     for table in tables(rows):
         assert [line for line in table.splitlines() if line and line not in lines] == []
+
+
+def test_what_the_plan_says_of_one_exposure_is_what_was_measured():
+    """On the scenes whose photographs differ, and no other."""
+    rows = json.loads((setting.REFERENCES.parent / "setting.json").read_text("utf-8"))
+    gains = {scene: fmean(b - a for a, b in pairs) for scene, pairs in pairs_of(rows, EVEN[0], from_today).items()}
+    assert gains.keys() == set(UNEVEN)
+    assert pytest.approx(gains, abs=0.051) == ONE_EXPOSURE_GAINS
