@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -24,6 +24,8 @@ __all__ = [
     "cameras_between", "depth_bounds", "interpolate_cameras", "look_at", "measured_views", "orbit_views",
     "pseudo_cameras", "unseen_views",
 ]  # fmt: skip
+
+T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
 
@@ -85,8 +87,7 @@ def orbit_views(
     nerfstudio have z up. The cameras are OpenCV.
     The renderer clips at depth 0.2: models with a radius below about 0.13 must be enlarged first.
 
-    Raises:
-        ValueError: if an argument is out of range, or `bounding_sphere` raises it.
+    Errors are those of `bounding_sphere`.
 
     Example:
         >>> corners = torch.tensor([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])
@@ -94,11 +95,6 @@ def orbit_views(
         >>> len(cameras), [round(x, 2) for x in cameras[0].forward.tolist()]  # 20 degrees downwards
         (4, [0.0, 0.34, 0.94])
     """
-    if count < 1 or not 0 < fill <= 1 or not 0 < arc <= 2 * math.pi or world not in get_args(World):
-        raise ValueError(
-            f"expected count >= 1, fill in (0, 1], arc in (0, 2 pi] and world one of {', '.join(get_args(World))}; got "
-            f"{count}, {fill}, {arc} and {world!r}."
-        )
     sphere = bounding_sphere(means, opacities)
     center, half_angle = sphere.center, math.atan(fill * math.tan(0.5 * FIELD_OF_VIEW))
     # At this distance the cone of view touches the sphere; the tangent in place of the sine would cut it.
@@ -126,19 +122,14 @@ def bounding_sphere(means: Tensor, opacities: Tensor) -> BoundingSphere:
     weighted by the activated opacities, (N,) or (N, 1); the means (N, 3) are finite world coordinates.
 
     Raises:
-        ValueError: if the shapes do not match, or the opacity is all 0 or concentrated at one point.
+        ValueError: if the opacity is all 0 or concentrated at one point.
 
     Example:
         >>> sphere = bounding_sphere(torch.tensor([[1.0, 0, 0], [3.0, 0, 0]]), torch.ones(2))
         >>> sphere.center.tolist(), sphere.radius, sphere.surroundings
         ([2.0, 0.0, 0.0], 1.0, False)
     """
-    n = means.shape[0]
-    if means.shape != (n, 3) or opacities.shape not in ((n,), (n, 1)):
-        raise ValueError(
-            f"expected means (N, 3) and opacities (N,) or (N, 1), got {tuple(means.shape)} and "
-            f"{tuple(opacities.shape)}."
-        )
+    n = len(means)
     points, weights = means.detach().double(), opacities.detach().double().reshape(n)
     if not bool(weights.sum() > 0):
         raise ValueError(f"there is nothing to look at: {n} Gaussians with a total opacity of 0.")
@@ -346,7 +337,7 @@ def measured_views(scene: Scene) -> dict[str, Sequence[Viewpoint]]:
     cameras = [view.camera for view in scene.train]
     if len(cameras) < 2:
         return {"train": scene.train}
-    nearest = nearest_neighbors(torch.stack([camera.position for camera in cameras]), 1)[1][:, 0].tolist()
+    nearest = [first for (first,) in _nearest(cameras, 1)]
     # Two cameras that are nearest to each other have one middle, but each its own continuation.
     pairs = sorted({(min(pair), max(pair)) for pair in enumerate(nearest)})
     new = {
@@ -376,18 +367,16 @@ def unseen_views(scene: Scene) -> list[Viewpoint]:
     if len(scene.train) < 2:
         raise ValueError(f"there is no camera between or beyond {len(scene.train)} training views: it takes two.")
     cameras, names = [view.camera for view in scene.train], [view.name for view in scene.train]
-    near = nearest_neighbors(torch.stack([camera.position for camera in cameras]), min(2, len(cameras) - 1))[1].tolist()
-    pairs = sorted({pair for i, of in enumerate(near) for j in of for pair in ((i, j), (j, i))})
+    pairs = sorted({pair for i, of in enumerate(_nearest(cameras, 2)) for j in of for pair in ((i, j), (j, i))})
     ways = [
         (f"between {names[i]} and {names[j]}", i, j, along) for i, j in pairs if i < j for along in (0.25, 0.5, 0.75)
     ]
     ways += [
         (f"beyond {names[i]}, away from {names[j]}", i, j, -along) for i, j in pairs for along in (1 / 3, 2 / 3, 1.0)
     ]
-    # Evenly through the list, so that of a hundred photographs no region is left out.
-    chosen = torch.linspace(0, len(ways) - 1, min(len(ways), MOST_UNSEEN)).round().int().tolist()
-    some = [ways[number] for number in chosen]
-    return [Viewpoint(name, camera_between(cameras[i], cameras[j], along, "arc")) for name, i, j, along in some]
+    return [
+        Viewpoint(name, camera_between(cameras[i], cameras[j], along, "arc")) for name, i, j, along in _spread(ways)
+    ]
 
 
 def amid_views(scene: Scene, neighbors: int = NEIGHBORS) -> list[Viewpoint]:
@@ -404,13 +393,24 @@ def amid_views(scene: Scene, neighbors: int = NEIGHBORS) -> list[Viewpoint]:
     cameras, names = [view.camera for view in scene.train], [view.name for view in scene.train]
     if len(cameras) <= FEW_CAMERAS:
         return []
-    positions = torch.stack([camera.position for camera in cameras])
-    near = nearest_neighbors(positions, min(neighbors, len(cameras) - 1))[1].tolist()
+    near = _nearest(cameras, neighbors)
     triples = sorted({tuple(sorted((i, *pair))) for i, of in enumerate(near) for pair in combinations(of, 2)})
-    chosen = torch.linspace(0, len(triples) - 1, min(len(triples), MOST_UNSEEN)).round().int().tolist()
     found = []
-    for i, j, k in (triples[number] for number in chosen):
+    for i, j, k in _spread(triples):
         middle = camera_between(cameras[i], cameras[j], 0.5, "arc")
         amid = camera_between(middle, cameras[k], 1 / 3, "arc")
         found.append(Viewpoint(f"amid {names[i]}, {names[j]} and {names[k]}", amid))
     return found
+
+
+def _nearest(cameras: Sequence[Camera], count: int) -> list[list[int]]:
+    """Return the numbers of so many others nearest to each camera, or of all others."""
+    positions = torch.stack([camera.position for camera in cameras])
+    numbers: list[list[int]] = nearest_neighbors(positions, min(count, len(cameras) - 1))[1].tolist()
+    return numbers
+
+
+def _spread(items: Sequence[T]) -> list[T]:
+    """Return at most `MOST_UNSEEN` items, evenly through the list: so no region of many photographs is left out."""
+    chosen = torch.linspace(0, len(items) - 1, min(len(items), MOST_UNSEEN)).round().int().tolist()
+    return [items[number] for number in chosen]

@@ -122,13 +122,8 @@ def test_of_a_place_the_middle_is_looked_at():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"count": 0}, "count >= 1"),
         ({"opacities": torch.zeros(4000)}, "total opacity of 0"),
-        ({"opacities": torch.ones(5)}, r"got \(4000, 3\) and \(5,\)"),
         ({"means": torch.ones(4000, 3)}, "lie on one point"),
-        ({"fill": 1.01}, r"fill in \(0, 1\]"),
-        ({"arc": 0.0}, r"arc in \(0, 2 pi\]"),
-        ({"world": "up"}, "one of y-down, y-up, z-up, z-down, x-up, x-down; got .* and 'up'"),
     ],
 )
 def test_what_cannot_be_looked_at_is_refused(change, message):
