@@ -86,6 +86,11 @@ class Camera:
         x, y = pixels.unbind(-1)
         return (depth > 0) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
+    def pixel_centers(self, like: Tensor) -> Tensor:
+        """Return the centers of all pixels (height, width, 2), of the dtype and on the device of a tensor."""
+        sides = (torch.arange(side, dtype=like.dtype, device=like.device) + 0.5 for side in (self.width, self.height))
+        return torch.stack(torch.meshgrid(*sides, indexing="xy"), -1)
+
     def resized(self, width: int, height: int) -> Camera:
         """Return the camera of the same picture resized to ``width`` x ``height`` pixels."""
         sx, sy = width / self.width, height / self.height

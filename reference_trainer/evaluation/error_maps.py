@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from kornia.geometry import create_meshgrid, remap
+from kornia.geometry import remap
 from torch import Tensor
 
 from ca_reg.error_maps import PLAIN_RATE, TRANSFER, ErrorMap, contrast, expected_error
@@ -126,9 +126,7 @@ class ErrorMaps:
         """Bring the nearest training photographs into a view by the model's depth, and compare."""
         others = [each for i, each in enumerate(self._photographs) if i != without]
         others.sort(key=lambda each: float((each[0].position - camera.position).norm()))
-        height, width = depth.shape
-        grid = create_meshgrid(height, width, normalized_coordinates=False, device=depth.device, dtype=depth.dtype)[0]
-        points = camera.lift(grid + 0.5, depth)
+        points = camera.lift(camera.pixel_centers(depth), depth)
         least, support = torch.full_like(depth, torch.inf), torch.zeros_like(depth)
         for other, photograph in others[:NEAREST]:
             at, far = other.project(points)

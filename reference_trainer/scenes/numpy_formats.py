@@ -123,8 +123,7 @@ def _idr_camera(world: NDArray[np.float64], width: int, height: int) -> Camera:
     k = intrinsics / intrinsics[2, 2]
     if abs(k[0, 1]) > 1e-3 * k[0, 0]:
         raise ValueError(f"its pixels are skewed: K is {k.tolist()}.")
-    fx, fy, cx, cy = (float(k[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Camera(torch.from_numpy(pose), fx, fy, cx, cy, width, height)
+    return Camera(torch.from_numpy(pose), k[0, 0], k[1, 1], k[0, 2], k[1, 2], width, height)
 
 
 def _sphere_bounds(camera: Camera, sphere: NDArray[np.float64]) -> tuple[float, float] | None:
@@ -197,9 +196,9 @@ def read_arrays(path: str | Path, folder: str | Path) -> tuple[list[Frame], Poin
     to_camera = not arrays.keys().isdisjoint(TO_CAMERA)
     for file, pose, of in zip(files, poses, k, strict=True):
         axes, at = (pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]) if to_camera else (pose[:3, :3].T, pose[:3, 3])
-        fx, fy, cx, cy = (float(of[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
         try:
-            camera = Camera(view_matrix(axes, at), fx, fy, cx, cy, *(size or image_size(file)))
+            pose = view_matrix(axes, at)
+            camera = Camera(pose, of[0, 0], of[1, 1], of[0, 2], of[1, 2], *(size or image_size(file)))
         except ValueError as error:
             raise ValueError(f"{path}: the camera of {file.name}: {error}") from error
         frames.append(Frame(file.name, file, camera))
@@ -268,12 +267,10 @@ def _npz_points(path: Path, arrays: Arrays, frames: Sequence[Frame]) -> PointClo
 
 def _lifted(depth: NDArray[Any], camera: Camera) -> NDArray[Any]:
     """Lift a map of depths along the camera's z axis to world points (H, W, 3); nan where the depth is not positive."""
-    from kornia.geometry import create_meshgrid
-
     height, width = depth.shape[:2]
-    pixels = create_meshgrid(height, width, normalized_coordinates=False, dtype=torch.float64)[0] + 0.5
+    camera = camera.resized(width, height)  # that of the file's pictures, which may be larger than the map
     depths = torch.from_numpy(depth.reshape(height, width).astype(np.float64))
-    return camera.lift(pixels, depths.where(depths > 0, torch.nan)).numpy()
+    return camera.lift(camera.pixel_centers(depths), depths.where(depths > 0, torch.nan)).numpy()
 
 
 def _npz_files(root: Path) -> list[Path]:

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import torch
-from kornia.geometry import create_meshgrid, remap
+from kornia.geometry import remap
 from torch import Tensor
 
 from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise, Reason
@@ -193,8 +193,8 @@ def with_photograph(image: Tensor, camera: Camera, view: View, share: float) -> 
 
     ``camera``, which sees the image, may be turned against that of the photograph, or have another field of view.
     """
-    centers = create_meshgrid(camera.height, camera.width, normalized_coordinates=False)[0] + 0.5
-    points = camera.to("cpu").lift(centers, torch.ones(camera.height, camera.width))
+    ones = torch.ones(camera.height, camera.width)
+    points = camera.to("cpu").lift(camera.pixel_centers(ones), ones)
     pixels, depth = view.camera.to("cpu").project(points)
     x, y = (pixels - 0.5)[None].unbind(-1)  # kornia's pixel centers are integers
     seen = remap(view.image.cpu()[None], x, y, padding_mode="border", align_corners=True)[0]

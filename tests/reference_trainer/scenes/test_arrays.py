@@ -131,6 +131,14 @@ def test_depth_is_lifted_along_the_axis_of_the_camera(scene):
     torch.testing.assert_close(cloud.positions[2 * 47], torch.tensor([4.0 + 5.0, 1 + y, -x]))  # turned: z = -right
 
 
+def test_depth_of_half_the_size_of_the_pictures_is_lifted_alike(scene):
+    depth, pictures = np.full((3, 6, 8), 5.0), np.zeros((3, 3, 12, 16))
+    expected = points_of(scene(extrinsic=to_camera(), intrinsic=INTRINSICS, depth=depth)).positions
+    twice = INTRINSICS * [[2.0], [2.0], [1.0]]
+    cloud = points_of(scene(extrinsic=to_camera(), intrinsic=twice, depth=depth, images=pictures))
+    torch.testing.assert_close(cloud.positions, expected)
+
+
 def test_few_of_many_points(scene):
     points = np.random.default_rng(0).random((3 * MOST_POINTS - 1, 3))
     cloud = points_of(scene(extrinsic=to_camera(), intrinsic=INTRINSICS, points=points))
