@@ -33,7 +33,7 @@ def with_prior(view: View, frame: Frame, root: Path, options: SceneOptions) -> V
     path = _find(frame, folder)
     prior = read_depth(path)
     camera = frame.camera.resized(view.camera.width, view.camera.height)
-    check_shape(path, prior, frame, camera)
+    check_shape(path, prior, camera, f"its photograph {frame.path}")
     known = prior.isfinite()
     low, high = (prior[known].min(), prior[known].max()) if bool(known.any()) else (0.0, 0.0)
     layers = torch.stack([((prior - low) / (high - low)).where(known, 0), known.to(prior)])
@@ -90,11 +90,10 @@ def point_prior(view: View, cloud: PointCloud) -> View:
     from_near = depths[seen].argsort()
     places, inverse = pixels[seen][from_near].numpy(), 1 / depths[seen][from_near].numpy()
     first = np.unique(places.astype(int), axis=0, return_index=True)[1]
-    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     try:
-        between = LinearNDInterpolator(places[first], inverse[first])(columns, rows)
+        between = LinearNDInterpolator(places[first], inverse[first])(camera.pixel_centers(depths).numpy())
     except (QhullError, ValueError):  # on one line; none
-        between = np.full_like(columns, np.nan)
+        between = np.full((camera.height, camera.width), np.nan)
     if not np.isfinite(between).any():
         raise ValueError(
             f'depth "points" needs points in every training view, and the {len(first)} pixels of {view.name} that see '

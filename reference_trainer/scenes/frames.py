@@ -56,17 +56,17 @@ def view_matrix(axes: NDArray[np.float64], position: NDArray[np.float64]) -> Ten
     return torch.from_numpy(pose)
 
 
-def check_shape(path: Path, layer: Tensor, frame: Frame, camera: Camera) -> None:
-    """Refuse a file, read as (..., H, W), that cannot be of a frame's photograph: its aspect ratio is not the camera's.
+def check_shape(path: Path, layer: Tensor, camera: Camera, other: str) -> None:
+    """Refuse a file, read as (..., H, W), whose aspect ratio is not that of a camera, with a ValueError.
 
-    Raises:
-        ValueError: with both sizes.
+    ``other`` says what has that of the camera.
     """
     height, width = layer.shape[-2:]
-    if abs(width / height * camera.height / camera.width - 1) > ASPECT_TOLERANCE:
+    stretch = (width / camera.width) / (height / camera.height)
+    if abs(stretch - 1) > ASPECT_TOLERANCE:
         raise ValueError(
-            f"{path} is {width}x{height}, which is not the shape of its photograph {frame.path} at {camera.width}x"
-            f"{camera.height}: the aspect ratios must agree."
+            f"{path} is {width}x{height}, which is not the shape of {other}: the aspect ratios of {width}x{height} and "
+            f"{camera.width}x{camera.height} differ by {abs(stretch - 1):.1%}. Choose the folder of the cameras."
         )
 
 
@@ -92,24 +92,19 @@ def load_view(frame: Frame, *, background: Tensor, downscale: float = 1.0, undis
             cannot be undone.
     """
     image, alpha = read_image(frame.path)
+    check_shape(frame.path, image, frame.camera, "its camera")
     height, width = image.shape[1:]
-    stretch = (width / frame.camera.width) / (height / frame.camera.height)
-    if abs(stretch - 1) > ASPECT_TOLERANCE:
-        raise ValueError(
-            f"{frame.path} is {width}x{height} but its camera is for {frame.camera.width}x{frame.camera.height}: the "
-            f"aspect ratios differ by {abs(stretch - 1):.1%}. Choose the picture folder that belongs to the cameras."
-        )
-    layers = {"image": image if alpha is None else composite(image, alpha, background)}
-    layers |= {} if alpha is None else {"alpha": alpha[None]}
+    mask = None
     if frame.mask is not None:
-        mask = read_image(frame.mask)[0].mean(0, keepdim=True)
-        layers["mask"] = 255 * mask if mask.max() < 1.5 / 255 else mask  # of zeros and ones: white is 1
-        check_shape(frame.mask, mask, frame, frame.camera.resized(width, height))
+        mask = read_image(frame.mask)[0].mean(0)
+        mask = 255 * mask if mask.max() < 1.5 / 255 else mask  # of zeros and ones: white is 1
+        check_shape(frame.mask, mask, frame.camera.resized(width, height), f"its photograph {frame.path}")
+    image = image if alpha is None else composite(image, alpha, background)
     camera = frame.camera.resized(max(1, round(width / downscale)), max(1, round(height / downscale)))
-    fits = {name: fitted(layer, camera, frame.distortion if undistort else ()) for name, layer in layers.items()}
-    image, camera = fits.pop("image")
-    flat = {name: layer[0] for name, (layer, _) in fits.items()}
-    return View(frame.name, camera.to(dtype=torch.float32), image, flat.get("alpha"), mask=flat.get("mask"))
+    distortion = frame.distortion if undistort else ()
+    alpha, mask = (None if x is None else fitted(x[None], camera, distortion)[0][0] for x in (alpha, mask))
+    image, camera = fitted(image, camera, distortion)
+    return View(frame.name, camera.to(dtype=torch.float32), image, alpha, mask=mask)
 
 
 LARGEST_ZOOM = 4.0
@@ -154,13 +149,11 @@ def undistort(
     Raises:
         ValueError: if the lens folds the picture over itself, or the zoom would exceed `LARGEST_ZOOM`.
     """
-    from kornia.geometry import create_meshgrid
-
     zoom = _zoom(camera, distortion)
     straight = replace(camera, fx=camera.fx * zoom, fy=camera.fy * zoom)
-    centers = create_meshgrid(camera.height, camera.width, normalized_coordinates=False, dtype=torch.float64)[0] + 0.5
-    source = _distort_zoomed(centers.flatten(0, 1), camera, distortion, zoom)
-    grid = 2 * source / torch.tensor([camera.width, camera.height], dtype=torch.float64) - 1
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+    source = _distort_zoomed(camera.pixel_centers(size).flatten(0, 1), camera, distortion, zoom)
+    grid = 2 * source / size - 1
     grid = grid.to(pixels.dtype).reshape(1, camera.height, camera.width, 2)
     # Without align_corners, -1 and 1 are the outer edges of the picture: the same half-pixel centers as the camera's.
     resampled = torch.nn.functional.grid_sample(
