@@ -158,14 +158,7 @@ class PointRecords:
         self._positions, self._colors, self._images, self._ends = array("d"), array("B"), array("q"), array("q")
 
     def add(self, position: Sequence[float], color: Sequence[int], images: NDArray[np.integer]) -> None:
-        """Add a point and the numbers of the images in its track.
-
-        Raises:
-            ValueError: if there are not three coordinates and three colors.
-            OverflowError: if a color does not fit a byte.
-        """
-        if len(position) != 3 or len(color) != 3:
-            raise ValueError(f"a point has three coordinates and three colors, got {[*position]} and {[*color]}.")
+        """Add a point: three coordinates, three bytes of color, and the numbers of the images in its track."""
         self._positions.extend(position)
         self._colors.extend(color)
         self._images.frombytes(images.astype(np.int64).tobytes())

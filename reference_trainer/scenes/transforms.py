@@ -88,9 +88,7 @@ def _frame(path: Path, file: Path, entry: dict[str, Any], back: NDArray[np.float
     """Build one frame from its entry, to which the file's shared values have been added."""
     measured = _file(path.parent, entry["file_path"], None) if "fl_x" in entry else file  # whose pixels are meant
     width, height = (int(entry["w"]), int(entry["h"])) if "w" in entry else image_size(measured)
-    if "fl_x" in entry:
-        fx = float(entry["fl_x"])
-    else:
+    if (fx := entry.get("fl_x")) is None:
         angle = float(entry["camera_angle_x"])
         if not 0 < angle < math.pi:
             raise ValueError(f"camera_angle_x must be in (0, pi) radians, got {angle}.")
@@ -98,16 +96,15 @@ def _frame(path: Path, file: Path, entry: dict[str, Any], back: NDArray[np.float
     camera = Camera(
         _world_to_camera(entry, back),
         fx=fx,
-        fy=float(entry.get("fl_y", fx)),
-        cx=float(entry.get("cx", width / 2)),
-        cy=float(entry.get("cy", height / 2)),
+        fy=entry.get("fl_y", fx),
+        cx=entry.get("cx", width / 2),
+        cy=entry.get("cy", height / 2),
         width=width,
         height=height,
     )
     distortion = tuple(float(entry.get(name, 0)) for name in ("k1", "k2", "p1", "p2", "k3"))
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, *distortion)
-    if not all(map(math.isfinite, intrinsics)):
-        raise ValueError(f"focal lengths, principal point and distortion must be finite, got {intrinsics}.")
+    if not all(map(math.isfinite, distortion)):
+        raise ValueError(f"the distortion must be finite, got {distortion}.")
     model = str(entry.get("camera_model", "OPENCV"))
     if model not in _OPENCV or entry.get("is_fisheye") or entry.get("k4"):
         raise ValueError(f"its camera {model} is no lens of OpenCV's model with k1 k2 p1 p2 k3: undistort it first")
