@@ -56,15 +56,12 @@ def describe_compilation(folder: str | None) -> str:
     return f"Compiling the renderer's loops, {when}: about 30 s of one core."
 
 
-@functools.cache
-def _warn(message: str) -> None:
-    """Log a message once per process."""
-    logging.getLogger(__name__).warning(message)
+_warn = functools.cache(logging.getLogger(__name__).warning)  # each message once per process
 
 
-def _log(name: str, where: str | None) -> None:
+def _log(name: str, folder: str | None) -> None:
     """Log that loops are compiled."""
-    _warn(describe_compilation(where))
+    _warn(describe_compilation(folder))
 
 
 _report: Callable[[str, str | None], None] = _log
