@@ -15,7 +15,7 @@ import tyro
 
 from reference_trainer.files import is_ply
 from reference_trainer.runs.folder import CONFIG, check_output, check_run, read_run_settings
-from reference_trainer.scenes.options import OrbitOptions, SceneOptions
+from reference_trainer.scenes.options import OrbitOptions, SceneOptions, check_folder
 
 __all__ = [
     "Device", "Orbit", "PlyScene", "RenderOptions", "Rendering", "Trust", "check_model", "check_out", "check_ply",
@@ -131,5 +131,5 @@ def check_out(out: Path | None, source: Path, where: SceneOptions | OrbitOptions
 def check_scenes(paths: Sequence[str]) -> None:
     """Refuse scene folders that are not there, with a FileNotFoundError for the first."""
     for path in paths:
-        if path != "synthetic" and not Path(path).exists():
-            raise FileNotFoundError(f"there is no scene folder {path}; for the built-in scene, say 'synthetic'.")
+        if path != "synthetic":
+            check_folder(path)

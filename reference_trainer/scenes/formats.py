@@ -14,7 +14,7 @@ from pathlib import Path
 from ca_reg.registry import imported
 from reference_trainer.scenes.frames import Frame
 from reference_trainer.scenes.images import is_image
-from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.options import SceneOptions, check_folder
 from reference_trainer.scenes.scene import PointCloud
 
 __all__ = [
@@ -104,8 +104,7 @@ def find_reader(root: Path, name: str) -> Reader:
         FileNotFoundError: if there is no such folder.
         ValueError: if there is no such format, or none fits the folder.
     """
-    if not root.is_dir():
-        raise FileNotFoundError(f"there is no scene folder {root}; for the built-in scene, say 'synthetic'.")
+    check_folder(root)
     module, colon, function = name.partition(":")
     if colon:
         try:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-__all__ = ["BACKGROUNDS", "OrbitOptions", "SceneOptions", "World"]
+__all__ = ["BACKGROUNDS", "OrbitOptions", "SceneOptions", "World", "check_folder"]
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -91,6 +91,12 @@ class SceneOptions:
         """Return the options with absolute paths, valid in any working directory."""
         path = self.path if self.path == "synthetic" else str(Path(self.path).resolve())
         return replace(self, path=path, init=None if self.init is None else str(Path(self.init).resolve()))
+
+
+def check_folder(path: str | Path) -> None:
+    """Refuse a scene folder that is not there, with a FileNotFoundError."""
+    if not Path(path).is_dir():
+        raise FileNotFoundError(f"there is no scene folder {path}; for the built-in scene, say 'synthetic'.")
 
 
 @dataclass(frozen=True)
