@@ -73,7 +73,8 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
     root = Path(options.path)
     capture = find_reader(root, options.format)(root, options)
     train, test = _split(root, capture, options)
-    _check_origin([*train, *test])
+    frames = [*train, *test]
+    _check_origin(frames)
     trained = [frame.name for frame in train]
     # Initial points must come from no photograph that is not trained on, whether it is tested or not.
     held_out = {frame.name for frame in [*capture.frames, *(capture.test or [])]} - set(trained)
@@ -86,41 +87,40 @@ def load_scene(options: SceneOptions, *, seed: int = 0, trains: bool = True) -> 
     check_no_leak(cloud, trained, held_out, allow=options.allow_test_points)
     chosen = capture.background if options.background == "auto" else options.background
     color: Tensor = torch.tensor(BACKGROUNDS[chosen])
-    downscale, about_size = _downscale([*train, *test], options.downscale)
+    downscale, about_size = _downscale(frames, options.downscale)
     load = partial(load_view, background=color, downscale=downscale, undistort=options.undistort)
-    views = {"train": tuple(map(load, train)), "test": tuple(map(load, test))}
-    about_masks = ""
-    if not trains:
-        about_points = ""
-    elif options.points == "dense":
-        cloud, about_points = dense_start(views["train"], cloud)
-    elif options.points == "auto" and start is None:
-        cloud, about_points = _enough_points(cloud, about_points, views["train"], train, generator)
-    about_near = _about_near(views["train"], cloud) if trains else ""
-    about_exposure = ""
-    if options.one_exposure:
-        *of_splits, about_exposure = with_one_exposure(views["train"], views["test"], cloud.positions)
-        views = dict(zip(views, of_splits, strict=True))
-    if options.depth == "points":
-        views["train"] = tuple(point_prior(view, cloud) for view in views["train"])
-    elif options.depth is not None:
-        views["train"] = tuple(
-            with_prior(view, frame, root, options) for view, frame in zip(views["train"], train, strict=True)
-        )
-    if any(frame.mask is not None for frame in [*train, *test]):
-        about_masks = "masks: scores count what is white in them, training uses the whole photographs"
-    about_lenses = _about_lenses([*train, *test], options)
+    views, test_views = tuple(map(load, train)), tuple(map(load, test))
     folders = sorted({frame.path.parent for frame in capture.frames})
     unread = [name for folder in folders for name in unreadable_photographs(folder)]
-    about_unread = f"not read: {', '.join(unread)}. Save them as JPEG or PNG, and find their cameras" * bool(unread)
-    notes = about_unread, capture.note, about_size, about_lenses, about_masks, about_points, about_near, about_exposure
+    notes = [
+        f"not read: {', '.join(unread)}. Save them as JPEG or PNG, and find their cameras" * bool(unread),
+        capture.note,
+        about_size,
+        _about_lenses(frames, options),
+        "masks: scores count what is white in them, training uses the whole photographs"
+        * any(frame.mask is not None for frame in frames),
+    ]
+    if trains:
+        if options.points == "dense":
+            cloud, about_points = dense_start(views, cloud)
+        elif options.points == "auto" and start is None:
+            cloud, about_points = _enough_points(cloud, about_points, views, train, generator)
+        notes += [about_points, _about_near(views, cloud)]
+    if options.one_exposure:
+        views, test_views, about_exposure = with_one_exposure(views, test_views, cloud.positions)
+        notes.append(about_exposure)
+    if options.depth == "points":
+        views = tuple(point_prior(view, cloud) for view in views)
+    elif options.depth is not None:
+        views = tuple(with_prior(view, frame, root, options) for view, frame in zip(views, train, strict=True))
     return Scene(
         name=root.resolve().name,
-        **views,
+        train=views,
+        test=test_views,
         points=cloud,
         start=start,
         background=color,
-        source=", ".join(sorted({str(frame.path.parent) for frame in [*train, *test]})),
+        source=", ".join(sorted({str(frame.path.parent) for frame in frames})),
         notes=tuple(filter(None, notes)),
     )
 
@@ -321,16 +321,11 @@ def file_split(path: str | Path, names: Sequence[str], views: int | None) -> tup
     ``names``, all images of the scene, in increasing order.
 
     Raises:
-        FileNotFoundError: if there is no such file.
         ValueError: if a list is missing or repeats an image, names unknown images, or trains on test images.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no split file {path}.")
-    content = read_json(path)
-    lists = (
-        {key: value for key, value in content.items() if isinstance(value, list)} if isinstance(content, dict) else {}
-    )
+    path, content = Path(path), read_json(path)
+    entries = content.items() if isinstance(content, dict) else ()
+    lists = {key: value for key, value in entries if isinstance(value, list)}
     lists = {ours: lists[theirs] for theirs, ours in NERFSTUDIO if theirs in lists} | lists
     for key, value in lists.items():
         if key.startswith(("train", "test")) and not all(isinstance(name, str) for name in value):

@@ -103,8 +103,3 @@ def test_file_split_says_what_is_wrong(tmp_path, text, views, reason):
     path.write_text(text)
     with pytest.raises(ValueError, match=reason):
         file_split(path, NAMES, views)
-
-
-def test_missing_split_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no split file"):
-        file_split(tmp_path / "split.json", NAMES, None)
