@@ -92,9 +92,7 @@ def filled(cloud: PointCloud, train: Sequence[Frame], generator: torch.Generator
     cameras = [frame.camera for frame in train]
     depths = torch.cat([camera.project(cloud.positions.double())[1] for camera in cameras])
     depths = depths[depths > 0]
-    if len(depths) < 2:
-        return cloud, ""
-    near, far = depths.quantile(torch.tensor([0.01, 0.99], dtype=depths.dtype)).tolist()
+    near, far = depths.quantile(torch.tensor([0.01, 0.99], dtype=depths.dtype)).tolist() if len(depths) else (0.0, 0.0)
     if near == far:
         return cloud, ""
     more = random_points_in_frusta(cameras, RANDOM_POINTS, near=near, far=far, generator=generator)

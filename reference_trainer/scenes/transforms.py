@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +55,8 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
         missing = [str(file) for file in files if not file.is_file()]
         if missing:
             raise FileNotFoundError(f"{path} names {len(missing)} images that are not there, such as {missing[:3]}.")
-        back: NDArray[np.float64] = np.linalg.inv(_applied(content)).astype(np.float64)
-        frames = [_frame(path, file, content | entry, back) for file, entry in zip(files, entries, strict=True)]
+        undo = _undo(content)
+        frames = [_frame(path, file, content | entry, undo) for file, entry in zip(files, entries, strict=True)]
     except FileNotFoundError:  # an OSError too, but no fault of this file's content
         raise
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, OSError) as error:
@@ -84,7 +85,7 @@ def _inside(root: Path, name: str) -> Path:
     return path_inside(root, name.replace("\\", "/"))
 
 
-def _frame(path: Path, file: Path, entry: dict[str, Any], back: NDArray[np.float64]) -> Frame:
+def _frame(path: Path, file: Path, entry: dict[str, Any], undo: NDArray[np.float64]) -> Frame:
     """Build one frame from its entry, to which the file's shared values have been added."""
     measured = _file(path.parent, entry["file_path"], None) if "fl_x" in entry else file  # whose pixels are meant
     width, height = (int(entry["w"]), int(entry["h"])) if "w" in entry else image_size(measured)
@@ -94,7 +95,7 @@ def _frame(path: Path, file: Path, entry: dict[str, Any], back: NDArray[np.float
             raise ValueError(f"camera_angle_x must be in (0, pi) radians, got {angle}.")
         fx = 0.5 * width / math.tan(0.5 * angle)
     camera = Camera(
-        _world_to_camera(entry, back),
+        _world_to_camera(entry, undo),
         fx=fx,
         fy=entry.get("fl_y", fx),
         cx=entry.get("cx", width / 2),
@@ -113,23 +114,24 @@ def _frame(path: Path, file: Path, entry: dict[str, Any], back: NDArray[np.float
     return Frame(name, file, camera, distortion if any(distortion) else (), mask=mask)
 
 
-def _applied(content: dict[str, Any]) -> NDArray[np.float64]:
-    """Return the transform that nerfstudio has applied to the world, (4, 4)."""
+def _undo(content: dict[str, Any]) -> NDArray[np.float64]:
+    """Return the inverse (4, 4) of the transform that nerfstudio has applied to the world."""
     matrix = np.eye(4)
     matrix[:3] = np.array(content.get("applied_transform", matrix[:3]), np.float64)[:3]
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-9:
         raise ValueError(f"applied_transform must be a finite 3x4 matrix with an inverse, got {matrix[:3].tolist()}.")
-    return matrix
+    inverse: NDArray[np.float64] = np.linalg.inv(matrix).astype(np.float64)
+    return inverse
 
 
-def _world_to_camera(entry: dict[str, Any], back: NDArray[np.float64]) -> torch.Tensor:
+def _world_to_camera(entry: dict[str, Any], undo: NDArray[np.float64]) -> torch.Tensor:
     """Convert an OpenGL camera-to-world matrix to the OpenCV view matrix (4, 4), float64."""
     matrix = np.array(entry["transform_matrix"], np.float64)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise ValueError(
             f"transform_matrix of {entry['file_path']} must be a finite 4x4 matrix, got {matrix.tolist()}."
         )
-    matrix = back @ matrix
+    matrix = undo @ matrix
     try:
         # The columns are the camera's axes in the world: OpenGL's up and back become OpenCV's down and forward.
         return view_matrix((matrix[:3, :3] * [1, -1, -1]).T, matrix[:3, 3])
@@ -147,9 +149,9 @@ def _points(path: Path, content: dict[str, Any], frames: list[Frame], options: S
             f"{path} names the points {file}, which are not there: copy them, or say --points random."
         )
     cloud = ply_points(file)
-    back = torch.from_numpy(np.linalg.inv(_applied(content))).to(cloud.positions)
-    positions = cloud.positions @ back[:3, :3].T + back[:3, 3]
-    return PointCloud(positions, cloud.colors, cloud.source, frozenset(frame.name for frame in frames))
+    undo = torch.from_numpy(_undo(content)).to(cloud.positions)
+    positions = cloud.positions @ undo[:3, :3].T + undo[:3, 3]
+    return replace(cloud, positions=positions, seen_by=frozenset(frame.name for frame in frames))
 
 
 def _read_transforms(root: Path, options: SceneOptions) -> Capture:
