@@ -99,6 +99,9 @@ def read_idr(path: str | Path, folder: str | Path) -> list[Frame]:
         if f"world_mat_{number}" not in arrays or not (by_name or cameras == len(files)):
             raise ValueError(f"{path} has {cameras} cameras, none for {file.name}; {folder} has {len(files)} images.")
         try:
+            for matrix in (world, sphere):
+                if matrix.shape not in ((4, 4), (3, 4)):
+                    raise ValueError(f"expected shape (4, 4), got {matrix.shape}.")
             camera = _idr_camera(world, *image_size(file))
             bounds = _sphere_bounds(camera, sphere)
         except (ValueError, np.linalg.LinAlgError) as error:
@@ -110,8 +113,6 @@ def read_idr(path: str | Path, folder: str | Path) -> list[Frame]:
 
 def _idr_camera(world: NDArray[np.float64], width: int, height: int) -> Camera:
     """Decompose K [R | t]: the RQ decomposition of K R, by the QR decomposition of its inverse."""
-    if world.shape not in ((4, 4), (3, 4)):
-        raise ValueError(f"expected shape (4, 4), got {world.shape}.")
     # K [R | t] is the same camera times any factor; this sign makes det R = 1.
     projection = world[:3] * np.sign(np.linalg.det(world[:3, :3]))
     turned, upper = np.linalg.qr(np.linalg.inv(projection[:, :3]))
@@ -186,7 +187,7 @@ def read_arrays(path: str | Path, folder: str | Path) -> tuple[list[Frame], Poin
             f"world), and intrinsics, called {', '.join(INTRINSICS)}; of names that mean something it has "
             f"{sorted(arrays)}."
         )
-    k = np.broadcast_to(k, (len(poses), 3, 3)) if k.shape == (3, 3) else k
+    k = np.broadcast_to(k, (*poses.shape[:1], 3, 3)) if k.shape == (3, 3) else k
     if poses.ndim != 3 or poses.shape[1:] not in ((3, 4), (4, 4)) or k.shape != (len(poses), 3, 3):
         raise ValueError(
             f"{path}: poses must have shape (S, 3, 4) or (S, 4, 4) and intrinsics (S, 3, 3), got {poses.shape} and "
@@ -229,7 +230,7 @@ def _map_size(arrays: Arrays) -> tuple[int, int] | None:
     maps = [shape for shape in maps if len(shape) > 3 or (len(shape) == 3 and shape[2] != 3)]
     if not maps:
         return None
-    height, width = maps[0][2:4] if maps[0][1] == 3 else maps[0][1:3]
+    height, width = maps[0][2:4] if len(maps[0]) > 3 and maps[0][1] == 3 else maps[0][1:3]
     return width, height
 
 
@@ -238,7 +239,7 @@ def _npz_points(path: Path, arrays: Arrays, frames: Sequence[Frame]) -> PointClo
     found = _first(arrays, POINTS)
     if found is None and "depth" in arrays:
         depths = arrays["depth"]
-        if depths.shape not in ((shape := (len(frames), *depths.shape[1:3])), (*shape, 1)):
+        if depths.ndim < 3 or depths.shape not in ((shape := (len(frames), *depths.shape[1:3])), (*shape, 1)):
             raise ValueError(f"{path}: depth must have shape (S, H, W), got {depths.shape} for {len(frames)} cameras.")
         found = np.stack([_lifted(depth, frame.camera) for depth, frame in zip(depths, frames, strict=True)])
     if found is None:

@@ -59,7 +59,7 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
         frames = [_frame(path, file, content | entry, undo) for file, entry in zip(files, entries, strict=True)]
     except FileNotFoundError:  # an OSError too, but no fault of this file's content
         raise
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, OSError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError, OSError) as error:
         reason = f"no entry {error}" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{path} is not a valid transforms file: {reason}") from error
     if len({frame.name for frame in frames}) != len(frames):

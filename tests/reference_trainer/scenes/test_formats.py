@@ -290,6 +290,14 @@ def test_bad_npz(photographs, bad):
         load_scene(SceneOptions(photographs))
 
 
+@pytest.mark.parametrize("sphere", [np.eye(4)[0], np.eye(3), np.array(1.0)], ids=["a row", "3x3", "a number"])
+def test_a_sphere_that_is_no_matrix_is_refused(photographs, sphere):
+    arrays = {f"{kind}_mat_{i}": x for i in range(3) for kind, x in (("world", np.eye(4)), ("scale", sphere))}
+    np.savez(photographs / "cameras_sphere.npz", **arrays)
+    with pytest.raises(ValueError, match=r"scale_mat_0 .*\(4, 4\)"):
+        load_scene(SceneOptions(photographs))
+
+
 def test_large_photographs_are_reduced_and_it_is_said(photographs, colmap_text, save_image):
     colmap_text(photographs / "sparse")
     for name in PICTURES:

@@ -129,6 +129,7 @@ def test_without_test_views_no_file_of_them_is_needed(blender_scene):
         (lambda c: c.pop("camera_angle_x"), "no entry 'camera_angle_x'"),
         (lambda c: c.update(camera_angle_x=math.pi), "camera_angle_x must be"),
         (lambda c: c.update(frames=3), "valid transforms file"),
+        (lambda c: c.update(applied_transform=3), "valid transforms file"),
         (lambda c: c["frames"].append(5), "valid transforms file"),
         (lambda c: c["frames"].append(c["frames"][0]), "lists an image twice"),
         (lambda c: c["frames"][0].update(file_path="../../etc/x"), "leads out"),
