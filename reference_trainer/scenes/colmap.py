@@ -50,7 +50,7 @@ def is_colmap(folder: Path) -> bool:
     return _has(folder, "cameras") and _has(folder, "images")
 
 
-def colmap_frames(model: ColmapModel, folder: str | Path) -> list[Frame]:
+def colmap_frames(model: ColmapModel, folder: Path) -> list[Frame]:
     """Pair the images of a reconstruction with their files in a folder, possibly of resized copies; sorted by name.
 
     Each frame holds the pinhole part of its camera and, separately, the distortion.

@@ -102,7 +102,7 @@ def point_prior(view: View, cloud: PointCloud) -> View:
     return replace(view, depth_prior=torch.from_numpy(1 / between).float())
 
 
-def read_depth(path: str | Path) -> Tensor:
+def read_depth(path: Path) -> Tensor:
     """Read a depth map with the values of the file, shape (H, W), float32; nan where they are not finite.
 
     The file is an ``.npy`` of floats or integers, (H, W) up to axes of length 1, or a gray PNG of 8 or 16 bits;
@@ -111,7 +111,7 @@ def read_depth(path: str | Path) -> Tensor:
     from PIL import Image
 
     try:
-        if Path(path).suffix == ".npy":
+        if path.suffix == ".npy":
             # Memory mapping refuses a header that announces more than the file holds before anything is allocated.
             array = np.load(path, mmap_mode="r", allow_pickle=False)
         else:

@@ -140,12 +140,11 @@ def resize_image(image: Tensor, width: int, height: int, mode: str = "bicubic") 
     return resized.clamp(0, 1)
 
 
-def list_images(folder: str | Path) -> list[Path]:
+def list_images(folder: Path) -> list[Path]:
     """Return the image files of a folder, sorted by name.
 
     Raises FileNotFoundError if there is no such folder, ValueError if it holds no images.
     """
-    folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no image folder {folder}.")
     files = sorted(filter(is_image, folder.iterdir()))
@@ -178,7 +177,7 @@ def unreadable_photographs(folder: Path) -> list[str]:
     return sorted(file.name for file in others if file.stem not in read and not file.name.startswith("."))
 
 
-def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
+def match_images(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """Find the file of each named image in a folder, possibly of resized copies.
 
     Files are matched by relative path, else by name without extension, else, if there are as many files as names and
@@ -189,7 +188,6 @@ def match_images(folder: str | Path, names: Sequence[str]) -> dict[str, Path]:
         FileNotFoundError: if there is no such folder.
         ValueError: if the names cannot be matched, or one leads out of the folder.
     """
-    folder = Path(folder)
     paths = {name: path_inside(folder, name) for name in names}
     if folder.is_dir() and all(path.is_file() for path in paths.values()):
         return paths

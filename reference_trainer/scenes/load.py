@@ -311,7 +311,7 @@ def blender_split(train_count: int, test_count: int, views: int) -> tuple[list[i
     return train, list(range(0, test_count, TEST_EVERY if test_count >= BLENDER_TEST_FRAMES else 1))
 
 
-def file_split(path: str | Path, names: Sequence[str], views: int | None) -> tuple[list[int], list[int]]:
+def file_split(path: Path, names: Sequence[str], views: int | None) -> tuple[list[int], list[int]]:
     """Read a split from a JSON file with a list ``test`` and one or more lists of training images.
 
     With ``views``, the training list is ``train_<views>``, else ``train`` if it has that length, else ``views`` images
@@ -323,7 +323,7 @@ def file_split(path: str | Path, names: Sequence[str], views: int | None) -> tup
     Raises:
         ValueError: if a list is missing or repeats an image, names unknown images, or trains on test images.
     """
-    path, content = Path(path), read_json(path)
+    content = read_json(path)
     entries = content.items() if isinstance(content, dict) else ()
     lists = {key: value for key, value in entries if isinstance(value, list)}
     lists = {ours: lists[theirs] for theirs, ours in NERFSTUDIO if theirs in lists} | lists

@@ -22,7 +22,7 @@ from reference_trainer.scenes.scene import PointCloud
 __all__ = ["ARRAYS", "IDR", "LLFF", "read_arrays", "read_idr", "read_llff"]
 
 
-def read_llff(path: str | Path, folder: str | Path) -> list[Frame]:
+def read_llff(path: Path, folder: Path) -> list[Frame]:
     """Read the cameras of ``poses_bounds.npy`` and pair them with the images of a folder in sorted order.
 
     Convention: each row holds a (3, 5) matrix, row-major, and the nearest and farthest depth. The matrix is
@@ -33,7 +33,6 @@ def read_llff(path: str | Path, folder: str | Path) -> list[Frame]:
         FileNotFoundError: if the file or the folder is missing.
         ValueError: if the file does not hold (N, 17) finite numbers with valid rotations, or there are not N images.
     """
-    path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}.")
     rows = read_npy(path.read_bytes(), path)
@@ -72,7 +71,7 @@ IDR_FILES = ("cameras_sphere.npz", "cameras.npz")
 DTU_IMAGES = (49, 64)
 
 
-def read_idr(path: str | Path, folder: str | Path) -> list[Frame]:
+def read_idr(path: Path, folder: Path) -> list[Frame]:
     """Read the cameras of ``cameras_sphere.npz`` and pair them with the images of a folder, sorted by name.
 
     Convention: ``world_mat_<i>`` is K [R | t], world to pixels of the pictures on disk, with OpenCV axes and the
@@ -85,7 +84,6 @@ def read_idr(path: str | Path, folder: str | Path) -> list[Frame]:
         FileNotFoundError: if the file or the folder is missing.
         ValueError: if a matrix is missing or makes no camera.
     """
-    path, folder = Path(path), Path(folder)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}.")
     arrays, files = read_npz(path), [file for file in list_images(folder) if not file.stem.endswith("_normal")]
@@ -159,7 +157,7 @@ MOST_POINTS = 50_000  # networks predict one point per pixel
 Arrays = Mapping[str, NDArray[Any]]
 
 
-def read_arrays(path: str | Path, folder: str | Path) -> tuple[list[Frame], PointCloud | None]:
+def read_arrays(path: Path, folder: Path) -> tuple[list[Frame], PointCloud | None]:
     """Read the S cameras of an ``.npz`` file, pair them with the images of a folder, and read the points, if any.
 
     Convention: OpenCV axes, half-integer pixel centers. ``extrinsic(s)``, ``world_to_camera``, ``w2c``,
@@ -176,7 +174,6 @@ def read_arrays(path: str | Path, folder: str | Path) -> tuple[list[Frame], Poin
         FileNotFoundError: if the folder is missing.
         ValueError: if there are no poses or intrinsics, or they do not make a valid camera for every image.
     """
-    path, folder = Path(path), Path(folder)
     asked = (*TO_CAMERA, *TO_WORLD, *INTRINSICS, *POINTS, *COLORS, *CONFIDENCE, *NAMES, "depth")
     arrays = read_npz(path, largest=LARGEST_ARRAY, names=asked)
     arrays = {name: x for name, x in arrays.items() if (x.dtype.kind == "U") == (name in NAMES)}

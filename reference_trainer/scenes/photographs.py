@@ -64,8 +64,6 @@ def sort_photographs(source: Path) -> tuple[list[Path], dict[str, str]]:
         FileNotFoundError: if there is no such file or folder.
         ImportError: if photographs or videos are there that need ca_reg[photos].
     """
-    if not source.exists():
-        raise FileNotFoundError(f"there is no folder {source}: give the folder of the photographs, or a video.")
     folder = photograph_folder(source, _KINDS)
     files = [source] if source.is_file() else [path for path in folder.iterdir() if path.is_file()]
     # Of what is there twice, the first choice comes first.

@@ -120,7 +120,7 @@ def colmap_points(folder: Path) -> PointCloud | None:
     return None
 
 
-def ply_points(path: str | Path, *, seen_by: frozenset[str] | None = None) -> PointCloud:
+def ply_points(path: Path, *, seen_by: frozenset[str] | None = None) -> PointCloud:
     """Read the vertices of a PLY file: a point cloud, or the centers and base colors of a 3DGS model.
 
     Colors are ``red green blue``, as bytes or as floats up to 1 or 255, else ``f_dc_0`` to ``f_dc_2``, else gray.
@@ -130,7 +130,6 @@ def ply_points(path: str | Path, *, seen_by: frozenset[str] | None = None) -> Po
         FileNotFoundError: if there is no such file.
         ValueError: if the file is truncated, not a PLY, has no points, or has invalid positions or colors.
     """
-    path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no point cloud {path}.")
     vertices = read_ply(path)

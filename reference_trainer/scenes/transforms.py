@@ -25,7 +25,7 @@ __all__ = ["BLENDER", "TRANSFORMS", "read_transforms"]
 _OPENCV = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")  # models that are parts of its model
 
 
-def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
+def read_transforms(path: Path, images: str | None = None) -> list[Frame]:
     """Read the frames of one ``transforms*.json``, in the order of the file.
 
     Convention: ``transform_matrix`` is camera to world with OpenGL axes (x right, y up, z back); the frames' cameras
@@ -43,7 +43,6 @@ def read_transforms(path: str | Path, images: str | None = None) -> list[Frame]:
         ValueError: if the file is not as described above, has a fisheye camera, or a path leads out of the scene
             folder.
     """
-    path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}.")
     try:
