@@ -86,6 +86,11 @@ class Camera:
         x, y = pixels.unbind(-1)
         return (depth > 0) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
+    def depths_of(self, points: Tensor) -> Tensor:
+        """Return the depths of those world points (N, 3) that are in the picture, in their order."""
+        pixels, depths = self.project(points)
+        return depths[self.inside(pixels, depths)]
+
     def pixel_centers(self, like: Tensor) -> Tensor:
         """Return the centers of all pixels (height, width, 2), of the dtype and on the device of a tensor."""
         sides = (torch.arange(side, dtype=like.dtype, device=like.device) + 0.5 for side in (self.width, self.height))

@@ -296,8 +296,7 @@ def _guided(camera: Camera, guide: PointCloud | None, farther: float = FARTHER) 
     """
     if guide is None or len(guide.positions) < GUIDES:
         return None
-    pixels, depths = camera.project(guide.positions)
-    depths = depths[camera.inside(pixels, depths)]
+    depths = camera.depths_of(guide.positions)
     if len(depths) < GUIDES:
         return None
     near, usual, far = depths.quantile(torch.tensor([0.01, 0.5, 0.99])).tolist()

@@ -201,8 +201,7 @@ def _check_origin(frames: list[Frame]) -> None:
 
 def _about_near(views: Sequence[View], cloud: PointCloud) -> str:
     """Return a note on points before the near plane, empty if they are few; refuse a world in which most are."""
-    seen = [(*view.camera.project(cloud.positions), view.camera) for view in views]
-    depths = torch.cat([depth[camera.inside(pixels, depth)] for pixels, depth, camera in seen])
+    depths = torch.cat([view.camera.depths_of(cloud.positions) for view in views])
     share = float((depths < NEAR_PLANE).float().mean()) if len(depths) else 0.0
     about = (
         f"{share:.0%} of the initial points that the cameras see are nearer than {NEAR_PLANE} units, where nothing is "

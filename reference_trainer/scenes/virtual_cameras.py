@@ -287,12 +287,8 @@ def depth_bounds(scene: Scene) -> tuple[float, float]:
     Raises:
         ValueError: if no initial point lies within a training picture.
     """
-    bounds = []
-    for view in scene.train:
-        pixels, depths = view.camera.project(scene.points.positions)
-        depths = depths[view.camera.inside(pixels, depths)]
-        if len(depths):
-            bounds.append(depths.quantile(depths.new_tensor([0.001, 0.999])).tolist())
+    seen = (view.camera.depths_of(scene.points.positions) for view in scene.train)
+    bounds = [depths.quantile(depths.new_tensor([0.001, 0.999])).tolist() for depths in seen if len(depths)]
     if not bounds:
         raise ValueError(f"scene {scene.name!r} has no initial point in a training picture: give other points.")
     return min(near for near, _ in bounds), max(far for _, far in bounds)

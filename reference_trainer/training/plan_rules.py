@@ -258,8 +258,7 @@ def dense_start(scene: Scene, config: TrainConfig) -> PlanItem:
         return PlanItem(name, "left out", f"{number} measured points are enough")
     cameras, matched = [view.camera for view in scene.train], 0
     for i, camera in enumerate(cameras):
-        pixels, depths = camera.project(scene.points.positions)
-        seen = depths[camera.inside(pixels, depths)]
+        seen = camera.depths_of(scene.points.positions)
         matched += len(seen) > 0 and bool(source_views(cameras, i, float(seen.median())))
     overlap = f"{matched} of {count} training views see the same as another one from 0.5 to 60 degrees apart"
     if matched < 2:

@@ -397,6 +397,5 @@ def _level(cameras: Sequence[Camera]) -> torch.Tensor:
 
 def _distance(gaussians: Gaussians, camera: Camera) -> float:
     """Return the median depth of the Gaussians that a camera sees; 1 if it sees none."""
-    pixels, depth = camera.project(gaussians.means)
-    depth = depth[camera.inside(pixels, depth)]
+    depth = camera.depths_of(gaussians.means)
     return depth.median().item() if len(depth) else 1.0
