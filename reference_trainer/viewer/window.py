@@ -89,6 +89,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         self._models: dict[str, ViewerModel] = {}
         self._chosen: Any = None  # of several models
         self._photographs: list[View] = []
+        self._followed: dict[str, Sequence[Viewpoint]] = {}  # the views of a training
         self._frusta: list[tuple[Any, Any]] = []  # position, and what viser shows there
         self._windows: dict[int, _Window] = {}
         self._changed = threading.Event()
@@ -144,7 +145,8 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
         if new:
             model = model_of(trainer)
             model = replace(model, gaussians=model.gaussians.map(torch.clone))
-            self.show(model, measured_views(trainer.scene))
+            self._followed = self._followed or measured_views(trainer.scene)  # which may have something to say, once
+            self.show(model, self._followed)
         with contextlib.suppress(NotFiniteError):  # the training reports it itself
             self.update()
         if new:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from browser import CHROMIUM, Page
+from heard import hearing
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -18,9 +19,11 @@ from reference_trainer.camera import Camera
 from reference_trainer.model.rendering import render_gaussians
 from reference_trainer.runs.measure import load_run_model
 from reference_trainer.runs.run import Monitoring, run_experiment
-from reference_trainer.scenes import load_scene
+from reference_trainer.scenes import load_scene, synthetic_scene
 from reference_trainer.scenes.scene import Viewpoint
 from reference_trainer.scenes.virtual_cameras import measured_views, orbit_views
+from reference_trainer.training.config import TrainConfig
+from reference_trainer.training.trainer import Trainer
 from reference_trainer.viewer import window
 from reference_trainer.viewer.picture import DisplayOptions, ViewerModel
 from reference_trainer.viewer.window import Viewer
@@ -357,6 +360,21 @@ def test_an_idle_page_waits_for_a_limited_time(server, monkeypatch):
     with Viewer(0) as viewer:
         viewer.serve()
     assert 0 < waits[0] <= 1  # on Windows, Ctrl-C is not heard before the end of a wait
+
+
+def test_a_training_without_test_views_says_so_once(viewer, server, monkeypatch):
+    """It was said again for every state of the model."""
+    monkeypatch.setattr(window, "TRAINING_SHARE", 1)
+    scene = dataclasses.replace(synthetic_scene(width=16, height=12, points=20), test=())
+    trainer = Trainer(scene, TrainConfig(iterations=3))
+    client = Client(scene.train[0].camera)
+    server.connect(client)
+    with hearing() as said:
+        for _ in range(3):
+            trainer.train_step()
+            viewer.follow(trainer)
+    assert len(client.shown) == 3
+    assert sum(line.startswith("No test views") for line in said) == 1
 
 
 def test_a_training_that_nobody_looks_at_is_left_alone(viewer):
