@@ -6,7 +6,6 @@ Nothing here imports torch, which takes seconds: a mistyped path is answered bef
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,11 +14,11 @@ import tyro
 
 from reference_trainer.files import is_ply
 from reference_trainer.runs.folder import CONFIG, check_output, check_run, read_run_settings
-from reference_trainer.scenes.options import OrbitOptions, SceneOptions, check_folder
+from reference_trainer.scenes.options import OrbitOptions, SceneOptions, check_scene
 
 __all__ = [
     "Device", "Orbit", "PlyScene", "RenderOptions", "Rendering", "Trust", "check_model", "check_out", "check_ply",
-    "check_scenes", "scene_or_orbit",
+    "scene_or_orbit",
 ]  # fmt: skip
 
 Device = Annotated[str, tyro.conf.arg(help='"cpu" or "cuda".')]
@@ -111,7 +110,7 @@ def check_model(source: Path, where: SceneOptions | OrbitOptions | None) -> None
     elif not source.is_file():
         raise FileNotFoundError(f"there is no file {source}: expected a standard 3DGS .ply, or the folder of a run.")
     elif isinstance(where, SceneOptions):
-        check_scenes([where.path])
+        check_scene(where.path)
 
 
 def check_ply(source: Path) -> None:
@@ -126,10 +125,3 @@ def check_out(out: Path | None, source: Path, where: SceneOptions | OrbitOptions
         # Only its settings say where the photographs of a run are.
         scene = read_run_settings(source / CONFIG)[0] if where is None else where
         check_output(out, scene.path if isinstance(scene, SceneOptions) else None, ())
-
-
-def check_scenes(paths: Sequence[str]) -> None:
-    """Refuse scene folders that are not there, with a FileNotFoundError for the first."""
-    for path in paths:
-        if path != "synthetic":
-            check_folder(path)

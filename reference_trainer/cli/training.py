@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from reference_trainer.cli.options import Device, Rendering, RenderOptions, check_scenes
+from reference_trainer.cli.options import Device, Rendering, RenderOptions
 from reference_trainer.runs.executors import ExecutorName
 from reference_trainer.runs.folder import PLAN, check_output, is_own_plan, modules_named
-from reference_trainer.scenes.options import SceneOptions
+from reference_trainer.scenes.options import SceneOptions, check_scene
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.recipes import RECIPES
 
@@ -136,7 +136,7 @@ class Train:
 
     def check(self) -> None:
         scene = _chosen(self.scene, self.folder)
-        check_scenes([scene.path])
+        check_scene(scene.path)
         check_output(self.out, scene.path, ())
         if self.deterministic and self.config.renderer == "gsplat":
             raise ValueError(
@@ -206,7 +206,7 @@ class Plan:
     """JSON file for the plan; by default none is written."""
 
     def check(self) -> None:
-        check_scenes([_chosen(self.scene, self.folder).path])
+        check_scene(_chosen(self.scene, self.folder).path)
         # An earlier plan, known by its entry for the items, may be overwritten, and no other file.
         if self.out is not None and self.out.is_dir():
             raise ValueError(f"{self.out} is a folder: --out is the file to write, such as {self.out / PLAN}.")
@@ -285,7 +285,8 @@ class Compare:
             raise ValueError(
                 f"give the scenes as arguments or as --path, not both: got {self.folders} and {self.path}."
             )
-        check_scenes(self._paths)
+        for path in self._paths:
+            check_scene(path)
 
     @property
     def _paths(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from ca_reg.registry import imported
 from reference_trainer.scenes.frames import Frame
 from reference_trainer.scenes.images import is_image
-from reference_trainer.scenes.options import SceneOptions, check_folder
+from reference_trainer.scenes.options import SceneOptions, check_scene
 from reference_trainer.scenes.scene import PointCloud
 
 __all__ = [
@@ -104,7 +104,7 @@ def find_reader(root: Path, name: str) -> Reader:
         FileNotFoundError: if there is no such folder.
         ValueError: if there is no such format, or none fits the folder.
     """
-    check_folder(root)
+    check_scene(root)
     module, colon, function = name.partition(":")
     if colon:
         try:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-__all__ = ["BACKGROUNDS", "OrbitOptions", "SceneOptions", "World", "check_folder"]
+__all__ = ["BACKGROUNDS", "OrbitOptions", "SceneOptions", "World", "check_scene"]
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -93,9 +93,9 @@ class SceneOptions:
         return replace(self, path=path, init=None if self.init is None else str(Path(self.init).resolve()))
 
 
-def check_folder(path: str | Path) -> None:
+def check_scene(path: str | Path) -> None:
     """Refuse a scene folder that is not there, with a FileNotFoundError."""
-    if not Path(path).is_dir():
+    if path != "synthetic" and not Path(path).is_dir():
         raise FileNotFoundError(f"there is no scene folder {path}; for the built-in scene, say 'synthetic'.")
 
 
