@@ -59,14 +59,15 @@ def view_matrix(axes: NDArray[np.float64], position: NDArray[np.float64]) -> Ten
 def check_shape(path: Path, layer: Tensor, camera: Camera, other: str) -> None:
     """Refuse a file, read as (..., H, W), whose aspect ratio is not that of a camera, with a ValueError.
 
-    ``other`` says what has that of the camera.
+    ``other`` names for the error what else has the shape of that camera.
     """
     height, width = layer.shape[-2:]
     stretch = (width / camera.width) / (height / camera.height)
     if abs(stretch - 1) > ASPECT_TOLERANCE:
         raise ValueError(
             f"{path} is {width}x{height}, which is not the shape of {other}: the aspect ratios of {width}x{height} and "
-            f"{camera.width}x{camera.height} differ by {abs(stretch - 1):.1%}. Choose the folder of the cameras."
+            f"{camera.width}x{camera.height} differ by {abs(stretch - 1):.1%}. Choose the folder that belongs to the "
+            "cameras."
         )
 
 
