@@ -234,39 +234,29 @@ def is_overridden() -> bool:
 
 
 @contextmanager
-def override(rasterizers: Sequence[type], opacity: Tensor) -> Iterator[list[RasterizerCall]]:
-    """Replace the opacities that this thread passes to the rasterizers.
-
-    The classes are patched once for all threads, and restored when the last override ends; renders of other threads are
-    unchanged. The opacities are activated, of all Gaussians, (N,) or (N, 1). Yields the list of calls so far.
-    """
-    mine = _Override(tuple(rasterizers), opacity, [])
-    with ExitStack() as undo:
-        for rasterizer in mine.rasterizers:
-            undo.enter_context(_patched(rasterizer))
-        undo.callback(_current.reset, _current.set(mine))
-        yield mine.calls
-
-
-@contextmanager
 def rendered_once(
     render: Callable[[], Any], opacity: Tensor, rasterizer: type | None
 ) -> Iterator[tuple[Any, RasterizerCall]]:
     """Render with other opacities; yield what ``render`` returned and its only call of the rasterizer.
 
-    Within the block the call may be made again. ``rasterizer`` is the class, None for the installed ones. Errors are
-    those of :func:`ca_reg.integrations.inria.render_fn`.
+    The opacities are activated, of all Gaussians, (N,) or (N, 1). ``rasterizer`` is the class, None for the installed
+    ones. The classes are patched once for all threads; renders of other threads are unchanged. Within the block the
+    call may be made again. Errors are those of :func:`ca_reg.integrations.inria.render_fn`.
     """
     rasterizers = rasterizer_classes() if rasterizer is None else [rasterizer]
-    with override(rasterizers, opacity) as calls:
+    mine = _Override(tuple(rasterizers), opacity, [])
+    with ExitStack() as undo:
+        for each in rasterizers:
+            undo.enter_context(_patched(each))
+        undo.callback(_current.reset, _current.set(mine))
         returned = render()
-        if len(calls) != 1:
-            names = ", ".join(rasterizer.__qualname__ for rasterizer in rasterizers)
+        if len(mine.calls) != 1:
+            names = ", ".join(each.__qualname__ for each in rasterizers)
             raise RuntimeError(
-                f"render called {names} {len(calls)} times, expected once; pass the class it uses as "
+                f"render called {names} {len(mine.calls)} times, expected once; pass the class it uses as "
                 "rasterizer=..., and a render function that makes one picture."
             )
-        yield returned, calls[0]
+        yield returned, mine.calls[0]
 
 
 @contextmanager
