@@ -59,10 +59,6 @@ class Sources:
                 found.update(re.split(r"[^\w-]", each)[0] for each in requires(package) or () if "extra ==" not in each)
         return name in found
 
-    def is_own(self, module: str) -> bool:
-        """Whether a module is a source file below the root, and not an extension to be compiled there."""
-        return _is_own(self.root, module)
-
     def read(self, path: Path, folder: Path, *, main: bool = False) -> list[tuple[int, str]]:
         """Read a file of the folder; return the modules it may import, each with its relative-import level.
 
@@ -84,7 +80,7 @@ class Sources:
                 origin = _absolute(module, node.level, node.module)
             elif isinstance(node, ast.Attribute) and node.attr.endswith(_SUFFIXES):
                 origin, names = called.get(ast.unparse(node.value), ""), {node.attr}
-            if origin and names and origin.partition(".")[0] != _OF_MESHES and not _is_own(folder, origin):
+            if origin and names and origin.partition(".")[0] != _OF_MESHES and not is_source(folder, origin):
                 self.rasterizers.setdefault(origin, set()).update(names)
             if isinstance(node, ast.ClassDef) and module and not main:
                 methods = {part.name: part.args for part in node.body if isinstance(part, ast.FunctionDef)}
@@ -138,7 +134,7 @@ def read_folder(folder: Path) -> Sources:
     return sources
 
 
-def _is_own(folder: Path, module: str) -> bool:
+def is_source(folder: Path, module: str) -> bool:
     """Whether a module is a source file of the folder, and not an extension to be compiled there."""
     package, *inner = module.split(".")
     if (folder / package / "setup.py").is_file():
@@ -182,8 +178,8 @@ def find_script(name: Path) -> Path | None:
 def set_command_line(script: Path | str, arguments: Sequence[str]) -> None:
     """Set ``sys.argv``, and ``sys.path[0]`` to the folder of the script, or for a module to the working directory."""
     sys.argv = [str(script), *arguments]
-    # `python -m` has put the working directory there; with -P (Python 3.11) there is no such entry.
-    if not getattr(sys.flags, "safe_path", False):
+    # `python -m` has put the working directory there; with -P there is no such entry.
+    if not sys.flags.safe_path:
         sys.path[0] = str(script.resolve().parent) if isinstance(script, Path) else os.getcwd()
 
 

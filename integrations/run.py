@@ -128,7 +128,7 @@ def resume(arguments: Sequence[str], script: Sequence[str], folder: str) -> None
     undo.enter_context(old_aliases())
     atexit.register(undo.close)  # holds them until the end
     with chdir(folder):
-        options = parse_options([*arguments, *this], in_child=True)
+        options = parse_options([*arguments, *this])
     _install(options)
     atexit.register(_leave_report, options.hook, own.name, folder_of_reports())
 
@@ -159,7 +159,7 @@ def _uninstall(hook: Hook) -> None:
         hook.uninstall()
 
 
-def parse_options(arguments: Sequence[str] | None, *, in_child: bool = False) -> argparse.Namespace:
+def parse_options(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse and check the options before anything runs; adds the `hook` that they ask for."""
     parser = argparse.ArgumentParser(
         prog="python -m ca_reg.integrations.run",
@@ -220,7 +220,7 @@ def parse_options(arguments: Sequence[str] | None, *, in_child: bool = False) ->
         parser.error(f"{options.script} is one of gsplat's, for which there is no --{meaningless[0].replace('_', '-')}")
     if options.patience < 0:
         parser.error("--patience must be at least 0")
-    if options.report is not None and not in_child:
+    if options.report is not None:
         options.report = options.report.absolute()  # the script may change the working directory
         if not options.report.parent.is_dir():
             parser.error(f"there is no folder {options.report.parent} for the report")

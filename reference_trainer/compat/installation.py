@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from types import ModuleType
 from unittest.mock import patch
 
-from ca_reg.integrations._scripts import Sources, in_children, read_folder
+from ca_reg.integrations._scripts import Sources, in_children, is_source, read_folder
 from reference_trainer.compat.cuda import cuda_on_cpu
 from reference_trainer.compat.extensions import (
     FreqEncoder,
@@ -128,7 +128,7 @@ def _modules(sources: Sources, outputs: tuple[str, ...] | None, rasterizer: str 
             modules |= {package: make_module(package, _C=inner), f"{package}._C": inner}
         # Built within a package of the repository, such as gaussian_splatting.simple_knn.
         within = next((module for own, module in extensions.items() if name.endswith(f".{own}")), None)
-        if within is not None and not sources.is_own(name):
+        if within is not None and not is_source(sources.root, name):
             modules[name] = within
     return modules
 
