@@ -1,13 +1,15 @@
-"""What a hook did, and a watchdog for training that is not regularized."""
+"""What a hook did, a watchdog for training that is not regularized, and the decay of opacities in scripts."""
 
 from __future__ import annotations
 
 import abc
 from collections import Counter
+from collections.abc import MutableMapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import TracebackType
 from typing import Any, Self
+from weakref import WeakKeyDictionary
 
 from torch import Tensor
 from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
@@ -15,7 +17,7 @@ from torch.optim.optimizer import Optimizer, register_optimizer_step_post_hook
 from ca_reg._check import check_count
 from ca_reg.decay import OpacityDecay
 
-from ._decaying import OPACITY_GROUPS, ScriptDecay
+from ._steps import leaves_of
 
 
 class Skip(StrEnum):
@@ -89,6 +91,57 @@ class Tally:
         return lines
 
 
+_OPACITY_GROUPS = ("opacity", "opacities")  # parameter groups in the INRIA family and in gsplat's trainers
+
+
+class _ScriptDecay:
+    """Fades a script's opacities after its optimizers' steps, once rendered ones are seen to be computed from them.
+
+    ``count`` is the number of optimizer steps after which they faded, ``found`` whether an optimizer was seen to train
+    what the rendered opacities are computed from.
+    """
+
+    def __init__(self, decay: OpacityDecay) -> None:
+        self.count = 0
+        self.found = False
+        self._decay = decay
+        self._rendered: list[Tensor] = []  # parameters that the opacities of the last render were computed from
+        self._training_step: int | None = None
+        self._steps: MutableMapping[Optimizer, int] = WeakKeyDictionary()  # of the last decay
+
+    def note_render(self, opacities: Tensor, step: int | None) -> None:
+        """Take note of the opacities of a training render, and of its training step, None if it is not known."""
+        self._training_step = step
+        if not self.found:  # the first time is before any densification, which replaces parameters
+            self._rendered = list(leaves_of(opacities))
+
+    def follow(self, optimizer: Optimizer, logits: Sequence[Tensor]) -> None:
+        """Decay after a step of an optimizer that trains these logits, once for each training step that is known."""
+        if not self.found and any(x is y for x in logits for y in self._rendered):
+            self.found = True
+            self._rendered.clear()  # a densification replaces them, and they need not stay
+        last = self._steps.get(optimizer, 0)
+        # The optimizer's own steps begin anew where a training is resumed.
+        step = last + 1 if self._training_step is None else self._training_step
+        self._steps[optimizer] = step
+        if self.found and step != last:  # torch tells the step of a subclass that calls its base's twice
+            for x in logits:
+                self._decay(x, step)
+            self.count += step > self._decay.start
+
+    def problem(self) -> str | None:
+        """Describe why nothing decayed, and what to do; None if something did."""
+        if not self.found:
+            return (
+                "Opacities do not decay: those that are rendered are computed from no parameter group that is named "
+                f"{' or '.join(_OPACITY_GROUPS)}. Leave out --opacity-decay, and call ca_reg.decay.OpacityDecay in the "
+                "script, after its optimizer's step; nerfstudio's splatfacto-ca has --pipeline.model.opacity-decay."
+            )
+        if not self.count:
+            return f"Opacities did not decay: the training ended before step {self._decay.start + 1} (--decay-start)."
+        return None
+
+
 class Hook(abc.ABC):
     """Regularizes scripts without edits, from `install` to `uninstall`, or within a ``with`` block.
 
@@ -103,7 +156,7 @@ class Hook(abc.ABC):
     def __init__(self, patience: int, decay: OpacityDecay | None = None) -> None:
         check_count(patience, "patience", minimum=0)
         self.tally = Tally()
-        self._decay = None if decay is None else ScriptDecay(decay)
+        self._decay = None if decay is None else _ScriptDecay(decay)
         self._patience = patience
         self._optimized = self._idle = 0  # optimizer steps: all, and those since the last regularized render
         self._handle: Any = None
@@ -132,11 +185,11 @@ class Hook(abc.ABC):
 
     def problem(self) -> str | None:
         """Describe a failure to regularize, or to decay, and its remedy; else None. A patience of 0 takes any."""
-        if shortfall := self._patience and self.tally.shortfall(self._optimized):
-            return f"{shortfall} {self._explain()}"
-        if self._decay is None or not (self._patience and self.tally.regularized):
+        if not self._patience:
             return None
-        return self._decay.problem()
+        if shortfall := self.tally.shortfall(self._optimized):
+            return f"{shortfall} {self._explain()}"
+        return self._decay.problem() if self._decay is not None and self.tally.regularized else None
 
     def __enter__(self) -> Self:
         """Install the hook unless it is installed."""
@@ -177,7 +230,8 @@ class Hook(abc.ABC):
             self._handle = None
 
     def _stepped(self, optimizer: Optimizer, args: Any, kwargs: Any) -> None:
-        logits = [x for group in optimizer.param_groups if group.get("name") in OPACITY_GROUPS for x in group["params"]]
+        groups = [group for group in optimizer.param_groups if group.get("name") in _OPACITY_GROUPS]
+        logits = [x for group in groups for x in group["params"]]
         self._optimized += bool(logits)
         # A last stage may freeze the Gaussians, and step their optimizers all the same (gsplat 1.6 with PPISP).
         if any(x.requires_grad for x in logits):
