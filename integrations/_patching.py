@@ -116,8 +116,8 @@ class PatchedClasses:
         update: Callable[[Any, int], None],
         check: Callable[[Any], None],
     ) -> None:
-        self.models: tuple[type, ...] = ()  # classes wrapped so far
-        self.names: list[str] = []  # of the rasterizers wrapped so far, for messages
+        self.models: tuple[type, ...] = ()  # classes wrapped since the start
+        self.names: list[str] = []  # of the rasterizers wrapped since the start, for messages
         self._patches: list[ClassPatch] = []
         self._rasterize, self._update, self._check = rasterize, update, check
         self._updated: Any = None  # the model whose update_learning_rate is running
@@ -133,6 +133,7 @@ class PatchedClasses:
 
     def start(self) -> None:
         """Wrap what is imported, and watch for the rest; raises if a class cannot be wrapped."""
+        self.models, self.names = (), []
         for rasterizer in self._given:
             self._wrap_rasterizer(rasterizer)
         self._imports.start()

@@ -131,14 +131,18 @@ class RasterizerHook(Hook):
         self._counts_zeros = self._chain.drops and not allow_zeros
         self._scope = scope
         self._seed = int(seed)
-        self._rasterizer = rasterizer
-        self._rasterizers = RASTERIZERS if rasterizer is None else (rasterizer,)
-        self._candidates = tuple(candidates) if rasterizer is None else ()
-        self._models = tuple(models)
         self._viewer = viewer
         self._iterations = Iterations(steps, self.note_lost)
-        self._patched: PatchedClasses | None = None
-        self._hooked: list[str] = []  # names of the classes, for messages
+        candidates = tuple(candidates) if rasterizer is None else ()
+        self._searched = (*RASTERIZERS, *candidates) if rasterizer is None else ()  # one of them must be installed
+        self._patched = PatchedClasses(
+            RASTERIZERS if rasterizer is None else (rasterizer,),
+            candidates,
+            models,
+            rasterize=self._rasterize,
+            update=self._iterations.update,
+            check=functools.partial(RasterizerCall.check, self._chain),
+        )
         self._zeros: tuple[Tensor, torch.cuda.Event | None] | None = None  # share of zero opacities, on its way
         self._generators: dict[tuple[int, torch.device], tuple[torch.Generator, int]] = {}
         self._latest: Tensor | None = None  # opacities of the last regularized render
@@ -151,24 +155,16 @@ class RasterizerHook(Hook):
         one is installed already, a TypeError if the rasterizer is not of the INRIA family, and a ValueError if it does
         not take what the regularizer needs.
         """
-        if self._patched is not None:
+        if self._handle is not None:
             raise RuntimeError("this hook is installed already; uninstall it first.")
-        if self._rasterizer is None:
-            find_installed((*self._rasterizers, *self._candidates))
-        self._patched = PatchedClasses(
-            self._rasterizers,
-            self._candidates,
-            self._models,
-            rasterize=self._rasterize,
-            update=self._iterations.update,
-            check=functools.partial(RasterizerCall.check, self._chain),
-        )
+        if self._searched:
+            find_installed(self._searched)
         try:
             self._patched.start()
-            self._count_steps()
         except BaseException:
-            self.uninstall()
+            self._patched.stop()
             raise
+        self._count_steps()
         return self
 
     def uninstall(self) -> None:
@@ -176,13 +172,11 @@ class RasterizerHook(Hook):
 
         Raises a RuntimeError if it is not installed, or the classes were wrapped again since; nothing changes then.
         """
-        if self._patched is None:
+        if self._handle is None:
             raise RuntimeError("this hook is not installed.")
         self._patched.check_removable()
-        self._hooked = self._patched.names
         self._stop_counting()
         self._patched.stop()
-        self._patched = None
 
     def step(self, step: int) -> None:
         """Begin a training step, counted from 1; from then on ``update_learning_rate`` is ignored."""
@@ -194,8 +188,7 @@ class RasterizerHook(Hook):
         return self._double_dropout(wait=True) or super().problem()
 
     def _explain(self) -> str:
-        names = self._hooked if self._patched is None else self._patched.names
-        hooked = " and ".join(names) or "nothing, because no known rasterizer was imported"
+        hooked = " and ".join(self._patched.names) or "nothing, because no known rasterizer was imported"
         return (
             f"Hooked is {hooked}; so far: {'; '.join(self.tally.lines())}. If the training renders with another class, "
             "pass it as rasterizer=... to RasterizerHook (--rasterizer module:Class); if the rates are 0 for longer "
@@ -209,7 +202,7 @@ class RasterizerHook(Hook):
             return self._leave(call, Skip.SCORE)
         means, opacities = call.arguments["means3D"], call.arguments["opacities"]
         site = CallSite.find()
-        model = None if self._patched is None else site.find_instance(self._patched.models)
+        model = site.find_instance(self._patched.models)
         if not torch.is_grad_enabled() or site.is_viewer(self._viewer):
             site.refuse_a_second_regularizer(self._names)
             return self._evaluate(call, self._iterations.evaluation_step(means if model is None else model))
