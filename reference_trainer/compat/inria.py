@@ -82,15 +82,13 @@ class InriaMoments:
     ) -> Tensor:
         """Return every Gaussian's share of the weighted variance, (N,), as `ca_reg.lists.ListMoments.shares`."""
         splats, background = self._splats(opacity, view, background)
-        shares = variance_shares(splats, multiplier, weights, background=background)
-        return shares.new_zeros(len(opacity)).index_copy(0, splats.indices, shares)
+        return splats.to_all(variance_shares(splats, multiplier, weights, background=background), len(opacity))
 
     @torch.no_grad()
     def weights(self, opacity: Tensor, view: Any) -> Tensor:
         """Return every Gaussian's blend weight, (N,), as `ca_reg.lists.ListMoments.weights`."""
         splats, _ = self._splats(opacity, view, None)
-        weights = splat_weights(splats).double()
-        return weights.new_zeros(len(opacity)).index_copy(0, splats.indices, weights)
+        return splats.to_all(splat_weights(splats).double(), len(opacity))
 
     def _splats(self, opacity: Tensor, view: Any, background: Tensor | None) -> tuple[Splats, Tensor]:
         """Project what ``render`` gives to the rasterizer; return its background as well, unless there is another."""

@@ -91,10 +91,7 @@ NEAR, FAR = 0.2, 100.0  # between which 2DGS maps depths to [0, 1] for its disto
 
 @torch.no_grad()
 def heaviest(splats: Splats) -> tuple[Tensor, Tensor]:
-    """Return the splat of the largest blend weight at every pixel, -1 where there is none, and that weight: (H, W).
-
-    Indices are those of the M splats, int64 (LoopSparseGS).
-    """
+    """Return which of the N Gaussians has the largest blend weight at every pixel, -1 for none, and that weight (H, W)."""
     rows = pad_entries(geometry_rows(splats))
     lists = splats.lists
     # Indices share a table with the weights, so that one pass reorders both: float32 counts splats exactly to 2^24.
@@ -105,7 +102,8 @@ def heaviest(splats: Splats) -> tuple[Tensor, Tensor]:
         index = block.gaussians.gather(1, place.flatten(1)).view_as(place).to(weights)
         found[block.tiles] = torch.stack([torch.where(weights > 0, index, -1.0), weights], dim=1)
     index, weight = untile(found, lists)
-    return index.long(), weight
+    # From the M splats to the N Gaussians; -1, for no splat, finds the appended -1.
+    return torch.nn.functional.pad(splats.indices, (0, 1), value=-1)[index.long()], weight
 
 
 def surface_planes(

@@ -305,25 +305,23 @@ class GaussianRasterizer(nn.Module):
             assert rendering.depth is not None
             found["depth"] = rendering.depth[None]
         if "weights" in parts:
-            found["weights"] = means3D.new_zeros(n).index_copy(0, splats.indices, splat_weights(splats))
+            found["weights"] = splats.to_all(splat_weights(splats), n)
         if surfaces:
             found |= surface_planes(rendering._replace(splats=splats), means3D, rotations, scales, camera)
         covered = rendering.alpha.detach() > 0
         found["radii"] = visible_radii(means3D, rotations, scales, camera, blur=settings.blur)
         if settings.pixel_weights is not None or "pixels" in parts:
             image = rendering.alpha if settings.pixel_weights is None else settings.pixel_weights
-            table = torch.stack([*contributions(splats, image.reshape(covered.shape)), projection.depths.detach()])
-            table = table.new_zeros(5, n).index_copy(1, splats.indices, table)
-            found |= dict(zip(SCORES, table, strict=True)) | {"my_radii": found["radii"], "pixels": table[1, :, None]}
+            sums = (*contributions(splats, image.reshape(covered.shape)), projection.depths.detach())
+            scores = [splats.to_all(each, n) for each in sums]
+            found |= dict(zip(SCORES, scores, strict=True)) | {"my_radii": found["radii"], "pixels": scores[1][:, None]}
         if "metric_counts" in parts:
             chosen = torch.zeros_like(covered) if settings.metric_map is None else settings.metric_map == 1
             count = contributions(splats, (chosen.view_as(covered) & bool(settings.get_flag)).to(means3D))[0]
-            found["metric_counts"] = means3D.new_zeros(n).index_copy(0, splats.indices, count).int()
+            found["metric_counts"] = splats.to_all(count, n).int()
         if not parts.isdisjoint(("heaviest", "largest_weight")):
-            index, weight = heaviest(splats)
-            # From the M splats in view to the N Gaussians; -1, for no splat, finds the appended -1.
-            index = torch.cat([splats.indices, splats.indices.new_tensor([-1])])[index]
-            found |= {"heaviest": index[None].int(), "largest_weight": weight[None]}
+            gaussian, weight = heaviest(splats)
+            found |= {"heaviest": gaussian[None].int(), "largest_weight": weight[None]}
         labels = (*(names or kinds), "radii")  # for a caller that names only one value
         return tuple(_output(kind, label, found, covered) for kind, label in zip(kinds, labels, strict=False))
 

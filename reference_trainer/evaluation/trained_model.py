@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import torch
 from torch import Tensor
 
 from ca_reg import CAScore, Chain, GaussianDropout, Params
@@ -118,9 +117,8 @@ class TrainedModel:
         """
         splats = self.splats(opacities, view)
         background = self.background if background is None else background
-        shares = torch.zeros(len(self.gaussians), dtype=torch.float64, device=opacities.device)
-        shares[splats.indices] = variance_shares(splats, multiplier, weights, background=background)
-        return shares
+        shares = variance_shares(splats, multiplier, weights, background=background)
+        return splats.to_all(shares, len(self.gaussians))
 
     def splats(self, opacities: Tensor, view: Viewpoint) -> Splats:
         """Project the model with given opacities (N,) and bin the splats into tiles."""

@@ -134,6 +134,10 @@ class Splats(NamedTuple):
         """Which of the M may have reached a pixel, see `ViewSplats`."""
         return self.lists.touched
 
+    def to_all(self, values: Tensor, count: int) -> Tensor:
+        """Return what the M have, (M, ...), in a table of all N = ``count``, (N, ...), zeros for the others."""
+        return values.new_zeros(count, *values.shape[1:]).index_copy(0, self.indices, values)
+
 
 class ViewSplats(Protocol):
     """What density control reads of a render, whichever renderer made it."""
