@@ -18,6 +18,7 @@ import re
 from collections.abc import Callable, Iterator, MutableMapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from types import ModuleType
 from typing import Any, ClassVar, Self
 
 import torch
@@ -32,13 +33,13 @@ from ._steps import FINISHED, leaves_of
 
 __all__ = [
     "Installation", "Rasterization", "Regularized", "install", "load_gsplat", "regularized", "unregularized_calls",
+    "version_numbers",
 ]  # fmt: skip
 
 Rasterization = Callable[..., tuple[Any, ...]]
 """``gsplat.rasterization``, or a function with its arguments that returns its ``info`` last."""
 
 _HOLDERS = ("gsplat", "gsplat.rendering")  # the public modules that scripts import the functions from
-_OLDEST = (1, 4)
 _PLAIN = ContextVar("_PLAIN", default=False)  # of a thread: another one may train meanwhile
 _EVIDENCE = 10.0  # dropped Gaussians expected in a list; that none is there by chance has probability e^-10
 
@@ -229,23 +230,23 @@ class Installation(Hook):
         self.functions: dict[str, Regularized] = {}
         self.steps = itertools.count()
         self._regularizer, self._generator, self._seed = regularizer, generator, seed
-        self._replaced: dict[tuple[str, str], Any] = {}
+        self._replaced: dict[tuple[ModuleType, str], Any] = {}
 
     def install(self) -> Self:
         """Replace the functions, as :func:`install`."""
         load_gsplat()
         found = {
             (holder, name): function
-            for holder in _HOLDERS
-            for name, function in vars(importlib.import_module(holder)).items()
+            for holder in map(importlib.import_module, _HOLDERS)
+            for name, function in vars(holder).items()
             if name.startswith("rasterization")
             and callable(function)
             and "opacities" in inspect.signature(function).parameters
         }
-        made = {id(x): Regularized(x, self._regularizer, self._generator, hook=self) for x in found.values()}
+        made = {x: Regularized(x, self._regularizer, self._generator, hook=self) for x in found.values()}
         for (holder, name), function in found.items():
-            self.functions[name] = made[id(function)]
-            setattr(importlib.import_module(holder), name, made[id(function)])
+            self.functions[name] = made[function]
+            setattr(holder, name, made[function])
         self._replaced, self.rasterization = found, self.functions["rasterization"]
         self._count_steps()
         return self
@@ -266,7 +267,7 @@ class Installation(Hook):
         self._stop_counting()
         while self._replaced:
             (holder, name), original = self._replaced.popitem()
-            setattr(importlib.import_module(holder), name, original)
+            setattr(holder, name, original)
 
     def _explain(self) -> str:
         return (
@@ -313,13 +314,17 @@ def load_gsplat(device: torch.device | None = None) -> Any:
     except ModuleNotFoundError as error:
         raise ImportError("this needs gsplat: pip install 'ca_reg[gsplat]' (and a CUDA device to run it).") from error
     version = str(getattr(gsplat, "__version__", ""))
-    number = [int(part) for part in re.findall(r"\d+", version)[:2]]
-    if not hasattr(gsplat, "rasterization") or (number and number < [*_OLDEST]):
+    if not hasattr(gsplat, "rasterization") or [] < version_numbers(version) < [1, 4]:
         raise ImportError(
             f"gsplat {version} is too old: 1.4 was the first whose rasterization can be regularized. Install "
             "gsplat>=1.4; a script that was written for an older one may need changes of its own."
         )
     return gsplat
+
+
+def version_numbers(version: str) -> list[int]:
+    """Return the first two numbers of a version, such as [1, 5]."""
+    return [int(part) for part in re.findall(r"\d+", version)[:2]]
 
 
 @contextmanager

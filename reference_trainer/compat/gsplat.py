@@ -15,7 +15,7 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from ca_reg.integrations.gsplat import load_gsplat
+from ca_reg.integrations.gsplat import load_gsplat, version_numbers
 from reference_trainer.camera import Camera
 from reference_trainer.compat.extensions import Refusing, make_module
 from reference_trainer.compat.planes import filtered
@@ -115,9 +115,7 @@ def _rasterize(given: SimpleNamespace, per_axis: bool) -> tuple[Tensor, Tensor, 
         """Arrange what M Gaussians of every camera have: [nnz, ...], or [C, N, ...] with zeros for the others."""
         if given.packed:
             return torch.cat([x[view.listed] for x, view in zip(values, views, strict=True)])
-        tables = [x.new_zeros(len(means), *x.shape[1:]) for x in values]
-        pairs = zip(tables, values, views, strict=True)
-        return torch.stack([table.index_copy(0, view.splats.indices, x) for table, x, view in pairs])
+        return torch.stack([view.splats.to_all(x, len(means)) for x, view in zip(values, views, strict=True)])
 
     def rows(table: Tensor, number: int, others: Tensor) -> Tensor:
         """Return what a table has for the M Gaussians of a camera, and ``others`` for those that it does not list."""
@@ -244,7 +242,7 @@ def gsplat_functions() -> Iterator[None]:
         )
         original = rendering.rasterization
         stand_ins: dict[Callable[..., Any], Callable[..., Any]] = {
-            original: make_rasterization(original, per_axis=_per_axis(gsplat.__version__)),
+            original: make_rasterization(original, per_axis=version_numbers(gsplat.__version__) >= [1, 5]),
             rendering.rasterization_2dgs: Refusing("gsplat.rasterization_2dgs", ADVICE),
             relocation.compute_relocation: compute_relocation,
             gsplat.quat_scale_to_covar_preci: quat_scale_to_covar_preci,
@@ -270,11 +268,6 @@ def _run_once(fn: Callable[..., Any], args: Any, verbose: bool = False) -> bool:
     """Run what ``gsplat.distributed.cli`` runs on every GPU, as on a machine with one."""
     fn(0, 0, 1, args)
     return True
-
-
-def _per_axis(version: str) -> bool:
-    """Whether radii are per axis: since gsplat 1.5."""
-    return tuple(int(part) for part in version.split(".")[:2]) >= (1, 5)
 
 
 def quat_scale_to_covar_preci(

@@ -7,7 +7,6 @@ gsplat's ``meta`` (1.4, 1.5, main) holds what the moments need: ``means2d, conic
 from __future__ import annotations
 
 import importlib
-import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ca_reg.functional import Multiplier
-from ca_reg.integrations.gsplat import unregularized_calls
+from ca_reg.integrations.gsplat import unregularized_calls, version_numbers
 from ca_reg.types import ExactMoments
 from reference_trainer.render.triton.moments import moments_of, shares_of
 from reference_trainer.render.triton.tiles import Lists
@@ -114,4 +113,4 @@ class GsplatMoments:
 def _max_alpha() -> float:
     """Return where the installed gsplat clamps alphas."""
     version = importlib.import_module("gsplat").__version__  # it is distributed by another name too: amd-gsplat
-    return 0.999 if [int(part) for part in re.findall(r"\d+", version)[:2]] < [1, 6] else 0.99
+    return 0.999 if version_numbers(version) < [1, 6] else 0.99
