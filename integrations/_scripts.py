@@ -10,7 +10,7 @@ import runpy
 import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
@@ -258,23 +258,18 @@ def in_children(function: str, *arguments: Any) -> Iterator[None]:
     else hands on the environment, and for their children. The function of an inner block is called first. The arguments
     must be representable in JSON.
     """
-    if not _folder:
-        with TemporaryDirectory(prefix="ca_reg_") as folder:
+    with ExitStack() as undo:
+        if not _folder:
+            folder = undo.enter_context(TemporaryDirectory(prefix="ca_reg_"))
             (Path(folder) / "sitecustomize.py").write_text(_SITECUSTOMIZE, encoding="utf-8")
-            _folder.append(folder)
             path = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
-            try:
-                with patch.dict(os.environ, PYTHONPATH=path), in_children(function, *arguments):
-                    yield
-            finally:
-                _folder.clear()
-        return
-    _calls.insert(0, (function, arguments))
-    try:
-        with patch.dict(os.environ, {_VARIABLE: json.dumps({"folder": _folder[0], "calls": _calls})}):
-            yield
-    finally:
-        _calls.pop(0)
+            undo.enter_context(patch.dict(os.environ, PYTHONPATH=path))
+            _folder.append(folder)
+            undo.callback(_folder.clear)
+        _calls.insert(0, (function, arguments))
+        undo.callback(_calls.pop, 0)
+        undo.enter_context(patch.dict(os.environ, {_VARIABLE: json.dumps({"folder": _folder[0], "calls": _calls})}))
+        yield
 
 
 def folder_of_reports() -> str:

@@ -91,7 +91,7 @@ NEAR, FAR = 0.2, 100.0  # between which 2DGS maps depths to [0, 1] for its disto
 
 @torch.no_grad()
 def heaviest(splats: Splats) -> tuple[Tensor, Tensor]:
-    """Return which of the N Gaussians has the largest blend weight at every pixel, -1 for none, and that weight (H, W)."""
+    """Return which of the N Gaussians has the largest blend weight at every pixel, -1 for none, and it: (H, W)."""
     rows = pad_entries(geometry_rows(splats))
     lists = splats.lists
     # Indices share a table with the weights, so that one pass reorders both: float32 counts splats exactly to 2^24.
