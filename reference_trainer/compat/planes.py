@@ -32,7 +32,7 @@ def filtered(
     scales: Tensor,
     camera: Camera,
     *,
-    blur: float = DILATION,
+    blur: float,
     floor: float | None,
 ) -> Splats:
     """Blur splats by ``blur`` instead of `DILATION`, in square pixels, and lower their opacities accordingly.
