@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import functools
 import inspect
+import itertools
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from importlib.util import find_spec
-from types import CodeType, FrameType, ModuleType
+from types import CodeType, FrameType
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -214,17 +215,11 @@ def find_installed(rasterizers: Iterable[str]) -> list[str]:
     return found
 
 
-def class_in(module: ModuleType, name: str) -> type | None:
-    """Return a class of a module by name, None if there is none."""
-    found = getattr(module, name, None)
-    return found if isinstance(found, type) else None
-
-
 def rasterizer_classes() -> list[type]:
     """Import the installed rasterizers and return their classes; raise ImportError if there are none."""
     name = RASTERIZERS[0].partition(":")[2]
-    found = [class_in(import_module(module), name) for module in find_installed(RASTERIZERS)]
-    return list(dict.fromkeys(cls for cls in found if cls is not None))
+    found = [getattr(import_module(module), name, None) for module in find_installed(RASTERIZERS)]
+    return list(dict.fromkeys(cls for cls in found if isinstance(cls, type)))
 
 
 def forward_signature(rasterizer: type) -> inspect.Signature:
@@ -313,24 +308,13 @@ class CallSite(NamedTuple):
     @classmethod
     def find(cls) -> CallSite:
         """Return the nearest caller named render..., else the nearest outside of this package and torch."""
-        found, outside = None, 0
-        frame: FrameType | None = sys._getframe(1)
-        while frame is not None and outside < _OUTWARD:
-            if _is_outside(frame.f_globals.get("__name__", "")):
-                outside += 1
-                found = found or frame
-                if frame.f_code.co_name.startswith("render"):
-                    found = frame
-                    break
-            frame = frame.f_back
-        if found is None:
+        outside = (x for x in _outward(sys._getframe(1)) if _is_outside(x.f_globals.get("__name__", "")))
+        nearest = list(itertools.islice(outside, _OUTWARD))
+        if not nearest:  # in a thread of autograd
             return cls({}, ())
-        place, frame = [], found
-        while frame is not None:  # traceback.walk_stack finds out the lines as well, which takes longer than the rest
-            place.append((frame.f_code, frame.f_lasti))
-            frame = frame.f_back
+        found = next((x for x in nearest if x.f_code.co_name.startswith("render")), nearest[0])
         variables = found.f_locals
-        site = cls(dict(variables), tuple(place))
+        site = cls(dict(variables), tuple((x.f_code, x.f_lasti) for x in _outward(found)))
         # Before Python 3.13 a function's frame keeps this snapshot, and with it all tensors that the function deletes
         # or replaces, until it returns. The variables themselves are elsewhere; those of a module are this dict.
         if isinstance(variables, dict) and found.f_code.co_flags & inspect.CO_OPTIMIZED:
@@ -366,6 +350,13 @@ def second_regularizers(chain: Chain) -> dict[str, str]:
     perturbs = any(isinstance(member, OpacityNoise) for member in chain)
     names = {"dropout_factor": "GaussianDropout"} if chain.drops else {}
     return names | ({"sigma_noise": "OpacityNoise"} if perturbs else {})
+
+
+def _outward(frame: FrameType | None) -> Iterator[FrameType]:
+    """Iterate over a frame and its callers; traceback.walk_stack takes longer, as it finds out their lines."""
+    while frame is not None:
+        yield frame
+        frame = frame.f_back
 
 
 @functools.lru_cache(maxsize=1024)

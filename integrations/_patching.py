@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ._calls import RasterizerCall, Signature, class_in, forward_signature, rasterizer_classes
+from ._calls import RasterizerCall, Signature, forward_signature, rasterizer_classes
 
 
 class AfterImport(MetaPathFinder):
@@ -151,8 +151,8 @@ class PatchedClasses:
 
     def _imported(self, module: ModuleType) -> None:
         for name, wrap in self._wanted[module.__name__]:
-            found = class_in(module, name)
-            if found is not None and all(patch.owner is not found for patch in self._patches):
+            found = getattr(module, name, None)
+            if isinstance(found, type) and all(patch.owner is not found for patch in self._patches):
                 wrap(found)
 
     def _wrap_candidate(self, rasterizer: type) -> None:
