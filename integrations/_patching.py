@@ -7,12 +7,12 @@ import inspect
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -21,22 +21,20 @@ from ._calls import RasterizerCall, Signature, forward_signature, rasterizer_cla
 
 
 class AfterImport(MetaPathFinder):
-    """Call back with a module right after anyone imports it; at :meth:`start` if it is imported already."""
+    """Within a block, call back with a module right after anyone imports it; at once if it is imported already."""
 
     def __init__(self, callbacks: Mapping[str, Callable[[ModuleType], None]]) -> None:
         self._callbacks = callbacks
 
-    def start(self) -> None:
-        """Call back with the modules that are imported already, and watch for the others."""
+    def __enter__(self) -> Self:
         for name, callback in self._callbacks.items():
             if name in sys.modules:
                 callback(sys.modules[name])
         sys.meta_path.insert(0, self)
+        return self
 
-    def stop(self) -> None:
-        """Stop watching; no effect if not watching."""
-        with suppress(ValueError):
-            sys.meta_path.remove(self)
+    def __exit__(self, *error: object) -> None:
+        sys.meta_path.remove(self)
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -129,14 +127,14 @@ class PatchedClasses:
         for place, wrap in found.items():
             module, _, name = place.partition(":")
             self._wanted.setdefault(module, []).append((name, wrap))
-        self._imports = AfterImport(dict.fromkeys(self._wanted, self._imported))
+        self._watching = ExitStack()
 
     def start(self) -> None:
         """Wrap what is imported, and watch for the rest; raises if a class cannot be wrapped."""
         self.models, self.names = (), []
         for rasterizer in self._given:
             self._wrap_rasterizer(rasterizer)
-        self._imports.start()
+        self._watching.enter_context(AfterImport(dict.fromkeys(self._wanted, self._imported)))
 
     def check_removable(self) -> None:
         """Raise RuntimeError if a method was wrapped again since."""
@@ -145,7 +143,7 @@ class PatchedClasses:
 
     def stop(self) -> None:
         """Restore the classes, and stop watching."""
-        self._imports.stop()
+        self._watching.close()
         while self._patches:
             self._patches.pop().remove()
 

@@ -366,22 +366,15 @@ def old_aliases() -> Iterator[None]:
         kinds = {kind.__name__: kind for kind in (int, float, bool, complex, object, str)}
         give(numpy, kinds | {"float_": numpy.float64, "complex_": numpy.complex128, "Inf": numpy.inf, "NaN": numpy.nan})
 
-    def to_matplotlib(cm: ModuleType) -> None:
-        give(cm, {"get_cmap": _get_cmap})
-
-    imports = AfterImport({"numpy": to_numpy, "matplotlib.cm": to_matplotlib})
-    imports.start()
     try:
-        yield
+        with AfterImport({"numpy": to_numpy, "matplotlib.cm": lambda cm: give(cm, {"get_cmap": _get_cmap})}):
+            yield
     finally:
-        imports.stop()
         for module, name in added:
             delattr(module, name)
 
 
 def _get_cmap(name: Any = None, lut: int | None = None) -> Any:
-    import matplotlib
+    from matplotlib import pyplot
 
-    found = matplotlib.rcParams["image.cmap"] if name is None else name
-    found = matplotlib.colormaps[found] if isinstance(found, str) else found
-    return found if lut is None else found.resampled(lut)
+    return pyplot.get_cmap(name, lut)

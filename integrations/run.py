@@ -91,8 +91,8 @@ def _launch(options: argparse.Namespace, arguments: Sequence[str], audit: Script
         if options.cpu:
             from reference_trainer.compat import stand_in
 
-            given = (options.sources.root, options.outputs, options.rasterizer)
-            undo.enter_context(stand_in() if options.gsplat else stand_in(*given))
+            given = () if options.gsplat else (options.sources.root, options.outputs, options.rasterizer)
+            undo.enter_context(stand_in(*given))
         if hook is not None:
             _install(options)
             undo.callback(_uninstall, hook)

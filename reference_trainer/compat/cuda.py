@@ -55,9 +55,7 @@ def cuda_on_cpu() -> Iterator[None]:
         undo.enter_context(patch.object(torch, "Generator", _Generator))
         undo.enter_context(patch.object(threading.Thread, "start", _start_on_cpu(threading.Thread.start)))
         undo.enter_context(_CudaMeansCpu())
-        torchvision = AfterImport({"torchvision.extension": _without_kernels})
-        torchvision.start()
-        undo.callback(torchvision.stop)
+        undo.enter_context(AfterImport({"torchvision.extension": _without_kernels}))
         yield
 
 

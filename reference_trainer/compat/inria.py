@@ -41,13 +41,6 @@ class InriaMoments:
     The arguments are those of `ca_reg.integrations.inria.render_fn`. As there, the opacities replace the model's, and a
     `ca_reg.integrations.inria.RasterizerHook` leaves these renders alone.
 
-    Args:
-        render: the code base's, called as ``render(view, gaussians, pipe, background)``.
-        gaussians: its model.
-        pipe: its pipeline settings.
-        background: color behind everything, shape (3,).
-        rasterizer: the class that ``render`` uses; by default the installed ones.
-
     Example:
         >>> from ca_reg import CAScore, attribute
         >>> moments = InriaMoments(render, gaussians, pipe, background)  # doctest: +SKIP
@@ -67,11 +60,8 @@ class InriaMoments:
         The opacities are activated, of all Gaussians, (N,) or (N, 1); the background is (3,) or (3, H, W), or None for
         the one that ``render`` gives to the rasterizer.
 
-        Raises:
-            ImportError: if no rasterizer is installed and none was given.
-            RuntimeError: if ``render`` does not call the rasterizer exactly once.
-            ValueError: if ``render`` does not rasterize as many Gaussians as there are opacities, or gives covariances
-                in place of scales and rotations, or matrices that are not those of a pinhole camera.
+        Errors are those of `ca_reg.integrations.inria.render_fn`, but for the alpha, and a ValueError if ``render``
+        gives covariances in place of scales and rotations, or matrices that are not those of a pinhole camera.
         """
         splats, background = self._splats(opacity, view, background)
         return render_moments(splats, multiplier, background=background)
