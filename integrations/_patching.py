@@ -13,6 +13,7 @@ from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any, NamedTuple, Self
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -60,36 +61,28 @@ class AfterImport(MetaPathFinder):
         return spec
 
 
-_INHERITED = object()
-
-
 class ClassPatch:
     """Replaces a method of a class, its own or inherited, by ``make(method)`` until :meth:`remove`."""
 
     def __init__(self, owner: type, name: str, make: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
-        self.owner = owner
-        self.name = name
-        # From the class dictionary: getattr would unwrap a staticmethod.
-        self._before = vars(owner).get(name, _INHERITED)
+        self.owner, self.name = owner, name
         self._replacement = make(getattr(owner, name))
-        setattr(owner, name, self._replacement)
+        self._patch = patch.object(owner, name, self._replacement)
+        self._patch.start()
 
     def check_removable(self) -> None:
         """Raise RuntimeError if the method was replaced again since; that replacement would be lost."""
-        now = vars(self.owner).get(self.name, _INHERITED)
+        now = vars(self.owner).get(self.name, "inherited")
         if now is not self._replacement:
             raise RuntimeError(
                 f"{self.owner.__qualname__}.{self.name} was replaced again after ca_reg had wrapped it; it is now "
-                f"{'inherited' if now is _INHERITED else now}. Undo the replacements in the reverse order."
+                f"{now}. Undo the replacements in the reverse order."
             )
 
     def remove(self) -> None:
         """Restore the same object, or delete the attribute if it was inherited; raises as `check_removable`."""
         self.check_removable()
-        if self._before is _INHERITED:
-            delattr(self.owner, self.name)
-        else:
-            setattr(self.owner, self.name, self._before)
+        self._patch.stop()
 
 
 class PatchedClasses:
@@ -138,8 +131,8 @@ class PatchedClasses:
 
     def check_removable(self) -> None:
         """Raise RuntimeError if a method was wrapped again since."""
-        for patch in self._patches:
-            patch.check_removable()
+        for each in self._patches:
+            each.check_removable()
 
     def stop(self) -> None:
         """Restore the classes, and stop watching."""
@@ -150,7 +143,7 @@ class PatchedClasses:
     def _imported(self, module: ModuleType) -> None:
         for name, wrap in self._wanted[module.__name__]:
             found = getattr(module, name, None)
-            if isinstance(found, type) and all(patch.owner is not found for patch in self._patches):
+            if isinstance(found, type) and all(each.owner is not found for each in self._patches):
                 wrap(found)
 
     def _wrap_candidate(self, rasterizer: type) -> None:
@@ -263,17 +256,17 @@ def _patched(rasterizer: type) -> Iterator[None]:
     """Keep a class patched, once for all overrides that need it."""
     with _lock:
         make = functools.partial(_with_other_opacities, rasterizer)
-        patch, users = _patches.get(rasterizer) or (ClassPatch(rasterizer, "forward", make), 0)
-        _patches[rasterizer] = patch, users + 1
+        found, users = _patches.get(rasterizer) or (ClassPatch(rasterizer, "forward", make), 0)
+        _patches[rasterizer] = found, users + 1
     try:
         yield
     finally:
         with _lock:
-            patch, users = _patches.pop(rasterizer)
+            found, users = _patches.pop(rasterizer)
             if users > 1:
-                _patches[rasterizer] = patch, users - 1
+                _patches[rasterizer] = found, users - 1
             else:
-                patch.remove()
+                found.remove()
 
 
 def _with_other_opacities(rasterizer: type, forward: Callable[..., Any]) -> Callable[..., Any]:

@@ -16,10 +16,10 @@ import inspect
 import itertools
 import re
 from collections.abc import Callable, Iterator, MutableMapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
-from types import ModuleType
 from typing import Any, ClassVar, Self
+from unittest.mock import patch
 
 import torch
 from torch import Tensor, nn
@@ -230,7 +230,7 @@ class Installation(Hook):
         self.functions: dict[str, Regularized] = {}
         self.steps = itertools.count()
         self._regularizer, self._generator, self._seed = regularizer, generator, seed
-        self._replaced: dict[tuple[ModuleType, str], Any] = {}
+        self._undo = ExitStack()
 
     def install(self) -> Self:
         """Replace the functions, as :func:`install`."""
@@ -246,8 +246,8 @@ class Installation(Hook):
         made = {x: Regularized(x, self._regularizer, self._generator, hook=self) for x in found.values()}
         for (holder, name), function in found.items():
             self.functions[name] = made[function]
-            setattr(holder, name, made[function])
-        self._replaced, self.rasterization = found, self.functions["rasterization"]
+            self._undo.enter_context(patch.object(holder, name, made[function]))
+        self.rasterization = self.functions["rasterization"]
         self._count_steps()
         return self
 
@@ -265,9 +265,7 @@ class Installation(Hook):
     def uninstall(self) -> None:
         """Restore the original functions; a second call does nothing."""
         self._stop_counting()
-        while self._replaced:
-            (holder, name), original = self._replaced.popitem()
-            setattr(holder, name, original)
+        self._undo.close()
 
     def _explain(self) -> str:
         return (
