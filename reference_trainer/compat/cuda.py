@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ContextDecorator, ExitStack, contextmanager
 from types import ModuleType, SimpleNamespace
 from typing import Any, Self
 from unittest.mock import patch
@@ -30,12 +30,9 @@ def cuda_on_cpu() -> Iterator[None]:
 
     With a CUDA device nothing is changed. Without one, ``device="cuda"`` in any torch function, ``.to("cuda")`` and
     ``.cuda()`` of tensors and modules, ``.pin_memory()``, ``torch.load`` by default or with ``map_location="cuda"``,
-    and ``torch.Generator("cuda")`` mean the CPU. In ``torch.cuda``, ``Event``, ``Stream``, ``stream``, ``synchronize``,
-    ``set_device``, ``current_device``, ``current_stream``, ``device``, ``device_of``, ``reset_peak_memory_stats`` and
-    ``nvtx`` run without effect, and ``mem_get_info``, ``get_device_properties``, ``get_device_name`` and
-    ``get_device_capability`` report a device with `MEMORY` bytes.
-    A torchvision built for CUDA can be imported, without its own kernels.
-    Everything is restored at the end. ``torch.cuda.is_available()`` stays False.
+    and ``torch.Generator("cuda")`` mean the CPU. In ``torch.cuda``, events, streams, devices, ``synchronize`` and
+    ``nvtx`` run without effect, and a device with `MEMORY` bytes is reported; ``is_available()`` stays False. A
+    torchvision built for CUDA can be imported, without its own kernels. Everything is restored at the end.
 
     A tensor moved to "cuda" stays the same tensor, as if it were there already: in-place writes affect both.
 
@@ -65,7 +62,7 @@ def _without_kernels(extension: ModuleType) -> None:
         sys.modules.setdefault(_REGISTRATIONS, ModuleType(_REGISTRATIONS))
 
 
-class _CudaMeansCpu(TorchFunctionMode):
+class _CudaMeansCpu(ContextDecorator, TorchFunctionMode):
     """Replaces CUDA devices among the arguments of torch functions by the CPU."""
 
     def __torch_function__(
@@ -95,13 +92,7 @@ def _start_on_cpu(start: Callable[[threading.Thread], None]) -> Callable[[thread
 
     @functools.wraps(start)
     def start_on_cpu(thread: threading.Thread) -> None:
-        run = thread.run
-
-        def run_on_cpu() -> None:
-            with _CudaMeansCpu():
-                run()
-
-        thread.run = run_on_cpu  # type: ignore[method-assign]
+        thread.run = _CudaMeansCpu()(thread.run)  # type: ignore[method-assign]
         start(thread)
 
     return start_on_cpu
