@@ -18,7 +18,7 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from ._calls import RasterizerCall, Signature, forward_signature, rasterizer_classes
+from ._calls import RASTERIZERS, RasterizerCall, Signature, find_installed, forward_signature, rasterizer_classes
 
 
 class AfterImport(MetaPathFinder):
@@ -89,7 +89,8 @@ class PatchedClasses:
     """Classes whose methods are wrapped from `start` to `stop`, those given as ``module:Class`` once imported.
 
     Args:
-        rasterizers: classes or names, which must be of the INRIA family.
+        rasterizer: the class or its name, which must be of the INRIA family; None for the usual ones of `RASTERIZERS`,
+            and the ``candidates``. One of these must be installed.
         candidates: names of further rasterizers, left alone if they are not of the family.
         models: names of classes with a method ``update_learning_rate``.
         rasterize: handles every call of a rasterizer.
@@ -99,7 +100,7 @@ class PatchedClasses:
 
     def __init__(
         self,
-        rasterizers: Iterable[type | str],
+        rasterizer: type | str | None,
         candidates: Iterable[str],
         models: Iterable[str],
         *,
@@ -112,9 +113,15 @@ class PatchedClasses:
         self._patches: list[ClassPatch] = []
         self._rasterize, self._update, self._check = rasterize, update, check
         self._updated: Any = None  # the model whose update_learning_rate is running
-        self._given = [x for x in rasterizers if isinstance(x, type)]
-        found: dict[str, Callable[[type], None]] = dict.fromkeys(candidates, self._wrap_candidate)
-        found |= dict.fromkeys((x for x in rasterizers if isinstance(x, str)), self._wrap_rasterizer)
+        self._rasterizer = rasterizer
+        candidates = tuple(candidates)
+        self._usual = (*RASTERIZERS, *candidates)
+        found: dict[str, Callable[[type], None]] = {}
+        if rasterizer is None:
+            found |= dict.fromkeys(candidates, self._wrap_candidate)
+            found |= dict.fromkeys(RASTERIZERS, self._wrap_rasterizer)
+        elif isinstance(rasterizer, str):
+            found[rasterizer] = self._wrap_rasterizer
         found |= dict.fromkeys(models, self._wrap_model)
         self._wanted: dict[str, list[tuple[str, Callable[[type], None]]]] = {}
         for place, wrap in found.items():
@@ -123,10 +130,12 @@ class PatchedClasses:
         self._watching = ExitStack()
 
     def start(self) -> None:
-        """Wrap what is imported, and watch for the rest; raises if a class cannot be wrapped."""
+        """Wrap what is imported, and watch for the rest; raises if a class cannot be wrapped or none is installed."""
         self.models, self.names = (), []
-        for rasterizer in self._given:
-            self._wrap_rasterizer(rasterizer)
+        if self._rasterizer is None:
+            find_installed(self._usual)
+        elif isinstance(self._rasterizer, type):
+            self._wrap_rasterizer(self._rasterizer)
         self._watching.enter_context(AfterImport(dict.fromkeys(self._wanted, self._imported)))
 
     def check_removable(self) -> None:
@@ -154,7 +163,6 @@ class PatchedClasses:
         self._wrap_rasterizer(rasterizer)
 
     def _wrap_rasterizer(self, rasterizer: type) -> None:
-        """Wrap the forward of a rasterizer."""
         signature = forward_signature(rasterizer)
         self._check(signature)
         function: Any = rasterizer.forward  # type: ignore[attr-defined]
@@ -270,7 +278,6 @@ def _patched(rasterizer: type) -> Iterator[None]:
 
 
 def _with_other_opacities(rasterizer: type, forward: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap the forward of a class."""
     signature = Signature(forward_signature(rasterizer))
 
     @functools.wraps(forward)

@@ -22,11 +22,9 @@ from ca_reg.decay import OpacityDecay
 from ca_reg.types import RenderFn, Rendering, read_rendering
 
 from ._calls import (
-    RASTERIZERS,
     CallSite,
     RasterizerCall,
     chain_of,
-    find_installed,
     hide_dropped,
     second_regularizers,
     white_alpha,
@@ -133,10 +131,8 @@ class RasterizerHook(Hook):
         self._seed = int(seed)
         self._viewer = viewer
         self._iterations = Iterations(steps, self.note_lost)
-        candidates = tuple(candidates) if rasterizer is None else ()
-        self._searched = (*RASTERIZERS, *candidates) if rasterizer is None else ()  # one of them must be installed
         self._patched = PatchedClasses(
-            RASTERIZERS if rasterizer is None else (rasterizer,),
+            rasterizer,
             candidates,
             models,
             rasterize=self._rasterize,
@@ -157,8 +153,6 @@ class RasterizerHook(Hook):
         """
         if self._handle is not None:
             raise RuntimeError("this hook is installed already; uninstall it first.")
-        if self._searched:
-            find_installed(self._searched)
         try:
             self._patched.start()
         except BaseException:

@@ -64,10 +64,10 @@ def filtered(
 
 
 @torch.no_grad()
-def contributions(splats: Splats, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def contributions(splats: Splats, image: Tensor) -> Tensor:
     """Sum over the pixels at which a splat is rendered: an image (H, W), ones, its blend weights, and its distances.
 
-    Each is (M,); distances are from the splat's center to the pixel, in pixels.
+    The sums are (4, M); distances are from the splat's center to the pixel, in pixels.
     """
     rows = pad_entries(geometry_rows(splats))
     sums = rows.new_zeros(4, rows.shape[1])
@@ -82,8 +82,7 @@ def contributions(splats: Splats, image: Tensor) -> tuple[Tensor, Tensor, Tensor
         values, ones = inside[block.tiles], inside[block.tiles][:, 1:]
         found = torch.cat([values @ covered, ones @ weights, ones @ (covered * torch.hypot(dx, dy))], dim=1)
         sums.index_add_(1, block.gaussians.flatten(), found.transpose(0, 1).flatten(1))
-    image_sums, counts, weight_sums, distances = sums[:, :-1]
-    return image_sums, counts, weight_sums, distances
+    return sums[:, :-1]
 
 
 NEAR, FAR = 0.2, 100.0  # between which 2DGS maps depths to [0, 1] for its distortion
