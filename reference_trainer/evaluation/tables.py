@@ -35,6 +35,7 @@ class Quantity(NamedTuple):
     title: str
     decimals: int  # the same down a column
     unit: float = 1.0
+    highest_is_best: bool | None = None  # None where neither end is a merit
 
     def text(self, values: Iterable[float]) -> str:
         """Return mean and standard deviation, see `format_mean_std`."""
@@ -42,13 +43,13 @@ class Quantity(NamedTuple):
 
 
 QUANTITIES = {
-    "psnr": Quantity("PSNR (dB)", 2),
+    "psnr": Quantity("PSNR (dB)", 2, highest_is_best=True),
     "psnr_expected": Quantity("expected PSNR (dB)", 1),
     "psnr_low": Quantity("from", 1),
     "psnr_high": Quantity("to (80 %)", 1),
-    "ssim": Quantity("SSIM", 3),
-    "lpips": Quantity("LPIPS", 3),
-    "ca_exact_half": Quantity(EXACT, 2, 1e-3),
+    "ssim": Quantity("SSIM", 3, highest_is_best=True),
+    "lpips": Quantity("LPIPS", 3, highest_is_best=False),
+    "ca_exact_half": Quantity(EXACT, 2, 1e-3, highest_is_best=False),
     "ca_exact": Quantity("exact CA{at} (1e-3)", 2, 1e-3),
     "ca_neutral": Quantity("neutral CA{at} (1e-3)", 2, 1e-3),
     "ca": Quantity("CA ({renders}) (1e-3)", 2, 1e-3),
@@ -56,7 +57,7 @@ QUANTITIES = {
     "visible": Quantity("visible", 3),
     "covered": Quantity("covered", 3),
     "cv": Quantity("CV", 4),
-    "depth_abs_rel": Quantity("depth AbsRel", 4),
+    "depth_abs_rel": Quantity("depth AbsRel", 4, highest_is_best=False),
     "depth_rmse": Quantity("depth RMSE", 4),
     "depth_mae": Quantity("depth MAE", 4),
     "depth_log10": Quantity("depth log10", 4),
@@ -67,7 +68,6 @@ QUANTITIES = {
 
 _NOT_EVERYWHERE = re.compile("psnr|ssim|lpips|depth")
 """Beginnings of the quantities that need a photograph, a view that was not trained on, weights or a true depth."""
-_HIGHEST_IS_BEST = {"PSNR (dB)": True, "SSIM": True, "LPIPS": False, EXACT: False, "depth AbsRel": False}
 
 
 def evaluation_table(data: Mapping[str, Any]) -> str:
@@ -282,11 +282,11 @@ def _best(head: Sequence[str], rows: Sequence[Sequence[str]]) -> set[tuple[int, 
     """Return row and column of the best figure of every column at unseen views; all that share it."""
     found = set()
     for j, title in enumerate(head):
-        words = next((words for words in _HIGHEST_IS_BEST if title.endswith(words)), None)
-        if words is None or title.startswith("train"):
+        highest = next((of.highest_is_best for of in QUANTITIES.values() if title.endswith(of.title)), None)
+        if highest is None or title.startswith("train"):
             continue  # at training views the best fit is no merit
         figures = {i: float(row[j].split()[0]) for i, row in enumerate(rows) if row[j] != _ABSENT}
-        best = (max if _HIGHEST_IS_BEST[words] else min)(figures.values(), default=None)
+        best = (max if highest else min)(figures.values(), default=None)
         found |= {(i, j) for i, figure in figures.items() if figure == best}
     return found
 

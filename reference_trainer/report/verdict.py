@@ -11,7 +11,7 @@ from itertools import cycle
 from typing import Any
 
 from reference_trainer.evaluation.style import COLORS, STRATEGIES
-from reference_trainer.evaluation.tables import QUANTITIES, mean_std
+from reference_trainer.evaluation.tables import QUANTITIES, Quantity, mean_std
 from reference_trainer.training.config import TrainConfig
 
 __all__ = [
@@ -20,13 +20,12 @@ __all__ = [
 ]  # fmt: skip
 
 _USUAL = TrainConfig()
-_COLUMNS = {
-    ("test", "psnr"): True, ("test", "psnr_expected"): None, ("test", "ssim"): True, ("test", "lpips"): False,
-    ("test", "ca_exact_half"): False, ("between", "psnr_expected"): None, ("around", "psnr_expected"): None,
-    ("between", "ca_exact_half"): False, ("around", "ca_exact_half"): False, ("train", "psnr"): None,
-    ("train", "ca_exact_half"): None, ("", "gaussians"): None, ("", "seconds"): None,
-}  # fmt: skip
-"""By split and quantity, in order: whether the highest is best; None where neither end is a merit."""
+_COLUMNS = (
+    ("test", "psnr"), ("test", "psnr_expected"), ("test", "ssim"), ("test", "lpips"), ("test", "ca_exact_half"),
+    ("between", "psnr_expected"), ("around", "psnr_expected"), ("between", "ca_exact_half"),
+    ("around", "ca_exact_half"), ("train", "psnr"), ("train", "ca_exact_half"), ("", "gaussians"), ("", "seconds"),
+)  # fmt: skip
+"""Split and quantity, in order."""
 
 FEWEST_SEEDS = 3
 """Of each of two runs, to say whether they can be told apart."""
@@ -105,6 +104,11 @@ class Rows:
         return QUANTITIES[key].text(self.values(split, key))
 
 
+def _shown(split: str, key: str) -> Quantity:
+    """Return how a quantity is shown at the views of a split; at training views neither end is a merit."""
+    return QUANTITIES[key]._replace(highest_is_best=None) if split == "train" else QUANTITIES[key]
+
+
 def _difference(rows: Rows, reference: Rows, split: str, key: str) -> tuple[float, float] | None:
     """Return the difference of two means and two standard errors of it, nan with a single seed; None without values."""
     values, others = rows.values(split, key), reference.values(split, key)
@@ -122,10 +126,10 @@ def differences(first: Rows, second: Rows) -> list[dict[str, object]]:
     not known well enough to tell anything apart.
     """
     rows: list[dict[str, object]] = []
-    for (split, key), highest in _COLUMNS.items():
+    for split, key in _COLUMNS:
         if (found := _difference(second, first, split, key)) is None:
             continue
-        title, decimals, unit = QUANTITIES[key]
+        title, decimals, unit, highest = _shown(split, key)
         delta, margin = (x / unit for x in found)
         known = min(len(of.values(split, key)) for of in (first, second)) >= FEWEST_SEEDS
         said = "no" if known else "unknown"
@@ -150,8 +154,8 @@ def score_columns(strategies: Sequence[Rows]) -> list[dict[str, Any]]:
     """
     columns = []
     unseen = {split for of in strategies for run in of.results for split in run["mean"]}
-    for (split, key), highest in _COLUMNS.items():
-        title, decimals, unit = QUANTITIES[key]
+    for split, key in _COLUMNS:
+        title, decimals, unit, highest = _shown(split, key)
         means = [of.mean(split, key) / unit for of in strategies]
         if (split and split not in unseen) or all(map(math.isnan, means)):
             continue
