@@ -68,8 +68,6 @@ def bake_ply(source: Path, target: Path, *, regularizer: str | None = None, trus
     model, facts = load_plain_ply_model(source, regularizer=regularizer, trust=trust)
     if not facts.regularizer:
         raise ValueError(f"{source} does not say what it was trained with: give --regularizer, such as 'dropout(0.2)'.")
-    if model.depends_on_camera:
-        raise ValueError(f"what is rendered after {facts.regularizer} depends on the camera: no file can hold it.")
     if model.factor == 1:
         raise ValueError(f"a model trained with {facts.regularizer} is rendered as it is: there is nothing to bake.")
     save_for_viewers(model, target)
@@ -93,9 +91,7 @@ def compress_ply(source: Path, target: Path, *, regularizer: str | None = None, 
         raise ImportError(f"{target.suffix} files need GaussForge: pip install 'ca_reg[web]'.") from error
     if target.exists():
         raise FileExistsError(f"{target} exists already: give another --out, or delete it.")
-    model, facts = load_ply_model(source, background=torch.zeros(3), regularizer=regularizer, trust=trust)
-    if model.depends_on_camera:
-        raise ValueError(f"what is rendered after {facts.regularizer} depends on the camera: no file can hold it.")
+    model, _ = load_ply_model(source, background=torch.zeros(3), regularizer=regularizer, trust=trust)
     with tempfile.TemporaryDirectory() as work:
         plain = Path(work, "plain.ply")
         save_for_viewers(model, plain)

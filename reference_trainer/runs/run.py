@@ -104,8 +104,10 @@ def model_of(trainer: Trainer) -> TrainedModel:
 def save_for_viewers(model: TrainedModel, path: Path, *, pad_to_degree: int | None = None) -> None:
     """Write a model as a PLY with its test-time opacities, marked so that nothing scales them again.
 
-    ``pad_to_degree`` is that of `save_ply`.
+    ``pad_to_degree`` is that of `save_ply`. Raises ValueError if these opacities depend on the camera.
     """
+    if model.depends_on_camera:
+        raise ValueError(f"what is rendered after {model.regularizer} depends on the camera: no file can hold it.")
     factor = model.factor  # a uniform one, which a reader can undo, or None
     save_ply(
         model.gaussians,
