@@ -9,7 +9,8 @@ import math
 import os
 import shlex
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from html import escape
 from importlib.resources import files
@@ -65,6 +66,20 @@ EACH = 3
 """Views that nobody took, at most, between the training cameras, and as many beyond them."""
 
 
+@dataclass(frozen=True)
+class _Run:
+    """A run as its folder holds it, and how the page shows it."""
+
+    label: str
+    folder: Path
+    path: str  # below the folder common to all runs
+    whole: bool  # whether it stands for all seeds of its strategy
+    options: SceneOptions
+    config: TrainConfig
+    results: dict[str, Any] | None  # None before the end of the training
+    color: str
+
+
 def write_report(
     runs: Sequence[Path],
     out: Path | None = None,
@@ -99,30 +114,28 @@ def write_report(
     if views < 1:
         raise ValueError(f"expected at least 1 view of each split, got {views}.")
     folders, runs = runs, [run for folder in runs for run in runs_of(folder) or [folder]]
-    path_of = dict(zip(runs, labels(runs), strict=True))
+    paths = dict(zip(runs, labels(runs), strict=True))
     file = report_file(folders, out)
-    for run in runs:
-        check_run(run)
-    configs = {run: read_run_settings(run / CONFIG)[1] for run in runs}
-    runs = sorted(runs, key=lambda run: natural_order(configs[run]))
-    names, found = unique_names([configs[run] for run in runs], [path_of[run] for run in runs]), list[Findings]()
-    for run, label in zip(runs, names, strict=True):
-        _log.info("[%d/%d] %s", len(found) + 1, len(runs), run)
-        found.append(find(run, label, views=views, device=device, trust=trust))
+    for folder in runs:
+        check_run(folder)
+    shown, found = _read(paths, whole=set(runs) - set(folders)), list[Findings]()
+    for run in shown:
+        _log.info("[%d/%d] %s", len(found) + 1, len(runs), run.folder)
+        found.append(find(run.folder, run.label, views=views, device=device, trust=trust))
         if not _of_one_place(found[0].scene, found[-1].scene):
             raise ValueError(
-                f"a report is about one scene, whose models turn together, but {runs[0]} was trained on "
-                f"{found[0].scene.name} and {run} on {found[-1].scene.name}, or with other cameras: write a report for "
-                "each."
+                f"a report is about one scene, whose models turn together, but {shown[0].folder} was trained on "
+                f"{found[0].scene.name} and {run.folder} on {found[-1].scene.name}, or with other cameras: write a "
+                "report for each."
             )
-    data = _data(dict(zip(names, runs, strict=True)), found, whole=set(runs) - set(folders))
+    data = _data(shown, found)
     # The page names the command that makes it again, without what is usual.
     command = ["ca-reg", "report", *map(str, folders)]
     command += ["--views", str(views)] * (views != VIEWS) + ["--trust", *sorted(trust)] * bool(trust)
     command += ["--out", str(out)] * (out is not None)
     data["made"] = f"{shlex.join(command)} · ca_reg {ca_reg.__version__} · {datetime.now():%Y-%m-%d %H:%M}"
     page = Template(_part("page.html")).substitute(
-        title=escape(f"{found[0].scene.name}: {', '.join(names)}", quote=False),
+        title=escape(f"{found[0].scene.name}: {', '.join(run.label for run in shown)}", quote=False),
         style=_part("page.css"),
         data=json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c"),  # nothing ends the script
         script=_part("models.js") + _part("curves.js") + _part("page.js"),
@@ -214,19 +227,29 @@ def _part(name: str) -> str:
     return (files(__package__) / name).read_text("utf-8")
 
 
-def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Path]) -> dict[str, Any]:
-    """Return all that the page shows, as plain data; runs in ``whole`` stand for all seeds of their strategy."""
-    configs = {label: read_run_settings(run / CONFIG) for label, run in runs.items()}
-    results = {label: read_results(run) for label, run in runs.items() if (run / RESULTS).exists()}
-    colors = dict(zip(runs, run_colors([config for _, config in configs.values()]), strict=True))
-    strategies = _strategies(runs, results, configs, whole, colors)
-    table, differing = _settings(configs)
+def _read(paths: Mapping[Path, str], whole: Collection[Path]) -> list[_Run]:
+    """Return the runs of a page, whose folders these are, in its order; those in ``whole`` stand for all seeds."""
+    settings = {run: read_run_settings(run / CONFIG) for run in paths}
+    runs = sorted(paths, key=lambda run: natural_order(settings[run][1]))
+    configs = [settings[run][1] for run in runs]
+    names, colors = unique_names(configs, [paths[run] for run in runs]), run_colors(configs)
+    results = [read_results(run) if (run / RESULTS).exists() else None for run in runs]
+    return [
+        _Run(name, run, paths[run], run in whole, settings[run][0], config, of, color)
+        for name, run, config, of, color in zip(names, runs, configs, results, colors, strict=True)
+    ]
+
+
+def _data(runs: Sequence[_Run], found: Sequence[Findings]) -> dict[str, Any]:
+    """Return all that the page shows, as plain data."""
+    strategies = _strategies(runs)
+    table, differing = _settings({run.label: (run.options, run.config) for run in runs})
     said, evidence = verdict(strategies, differing)
-    scenes = dict.fromkeys(options.path for options, _ in configs.values())
-    notes = [note for scene in scenes for note in left_out(Path(scene))]
+    notes = [note for scene in dict.fromkeys(run.options.path for run in runs) for note in left_out(Path(scene))]
     notes += [note for each in found for note in each.notes]
-    notes += [f"{label}: no scores, it has not been trained to its end." for label in runs if label not in results]
+    notes += [f"{run.label}: no scores, it has not been trained to its end." for run in runs if run.results is None]
     curves, missing = _curves(runs)
+    logged = {curve["run"] for curve in curves}
     middle = next((each.heat.mean for each in found if each.heat is not None), 1.0)
     low, high = (end * middle for end in PER_WEIGHT_SCALE)
     attribution = [row for each in found if (row := each.attribution())]
@@ -235,14 +258,13 @@ def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Pa
         "notes": notes + missing,
         "scene": found[0].scene.name,
         "verdict": said,
-        "evidence": evidence
-        + [line for each in found for line in _hanging(each, runs[each.label], configs[each.label][0])],
+        "evidence": evidence + [line for run, each in zip(runs, found, strict=True) for line in _hanging(each, run)],
         "strategies": [{"name": of.name, "seeds": len(of.results), "color": of.color} for of in strategies],
         "scores": score_columns(strategies),
         "settings": table,
         "curves": curves,
-        "exact": all(logs_exact(runs[curve["run"]]) for curve in curves),
-        "perView": {label: evaluation_table(_renamed(of)) for label, of in results.items()},
+        "exact": all(logs_exact(run.folder) for run in runs if run.label in logged),
+        "perView": {run.label: evaluation_table(_renamed(run.results)) for run in runs if run.results is not None},
         "attribution": markdown_table(attribution, list(attribution[0])) if attribution else "",
         "legend": image_uri(heat_map(torch.linspace(0, 1, 256)[None].expand(8, -1), 1.0)),
         "ends": {"heat": [f"{low:.2g}", f"{high:.2g}"], "error": ERROR_PICTURE_RANGE, "ca": CA_PICTURE_RANGE},
@@ -252,7 +274,7 @@ def _data(runs: dict[str, Path], found: Sequence[Findings], whole: Collection[Pa
             {"caption": f"{each.label}: {what}", "src": uri} for each in found for what, uri in each.veils.items()
         ],
         "flight": _flight(found[0]),
-        "runs": [each.packed(low, high) | {"color": colors[each.label]} for each in found],
+        "runs": [each.packed(low, high) | {"color": run.color} for run, each in zip(runs, found, strict=True)],
     }
 
 
@@ -268,39 +290,30 @@ def _trained(each: Findings) -> str:
     return f"{each.label}: {steps} with {regularizer}; {len(each.model.gaussians):,} Gaussians"
 
 
-def _strategies(
-    runs: dict[str, Path],
-    results: dict[str, dict[str, Any]],
-    configs: dict[str, tuple[SceneOptions, TrainConfig]],
-    whole: Collection[Path],
-    colors: dict[str, str],
-) -> list[Rows]:
+def _strategies(runs: Sequence[_Run]) -> list[Rows]:
     """Return the rows of every strategy: runs that differ in nothing but the seed are one, as in a comparison."""
-    found: dict[object, tuple[list[str], dict[int, dict[str, Any]]]] = {}
-    for label, run in runs.items():
-        scene, config = configs[label]
-        of = {config.seed: results[label]} if label in results else {}
-        if run in whole:
-            for other in map(read_results, sorted(path.parent for path in run.parent.glob(f"seed_*/{RESULTS}"))):
+    found: dict[object, tuple[list[_Run], dict[int, dict[str, Any]]]] = {}
+    for run in runs:
+        of = {} if run.results is None else {run.config.seed: run.results}
+        if run.whole:
+            for other in map(read_results, sorted(path.parent for path in run.folder.parent.glob(f"seed_*/{RESULTS}"))):
                 of.setdefault(other["config"]["seed"], other)
-        key: object = label if run in whole else (scene, dataclasses.replace(config, seed=0))
+        key: object = run.label if run.whole else (run.options, dataclasses.replace(run.config, seed=0))
         # The same settings and seed again, perhaps from another machine: kept apart, or one would hide the other.
-        if key in found and config.seed in found[key][1]:
-            key = label
+        if key in found and run.config.seed in found[key][1]:
+            key = run.label
         if of:
             same, seeds = found.setdefault(key, ([], {}))
-            same.append(label)
+            same.append(run)
             seeds |= of
-    first = [same[0] for same, _ in found.values()]
-    path_of = dict(zip(runs, labels([*runs.values()]), strict=True))
-    paths = [", ".join(path_of[label] for label in same) for same, _ in found.values()]
-    names = unique_names([configs[label][1] for label in first], paths)
+    paths = [", ".join(run.path for run in same) for same, _ in found.values()]
+    names = unique_names([same[0].config for same, _ in found.values()], paths)
     return [
         Rows(
-            name if len(same) > 1 else same[0],
-            not natural_order(configs[same[0]][1])[0],
+            name if len(same) > 1 else same[0].label,
+            not natural_order(same[0].config)[0],
             list(seeds.values()),
-            colors[same[0]],
+            same[0].color,
         )
         for name, (same, seeds) in zip(names, found.values(), strict=True)
     ]
@@ -319,19 +332,20 @@ def _settings(configs: dict[str, tuple[SceneOptions, TrainConfig]]) -> tuple[str
     return markdown_table(rows, ["setting", *configs]) if rows else "", [x for x in differing if x not in named]
 
 
-def _curves(runs: dict[str, Path]) -> tuple[list[dict[str, Any]], list[str]]:
+def _curves(runs: Sequence[_Run]) -> tuple[list[dict[str, Any]], list[str]]:
     """Return CA in 1e-3 and PSNR against the step of every run and group of views, and notes on what is missing."""
     curves, missing = list[dict[str, Any]](), []
-    for label, run in runs.items():
+    for run in runs:
+        gap = f"{run.label}: no CA and PSNR against the step"
         try:
-            columns = read_dynamics(run)
+            columns = read_dynamics(run.folder)
         except FileNotFoundError:
-            missing.append(f"{label}: no CA and PSNR against the step, because nothing was measured while it trained.")
+            missing.append(f"{gap}, because nothing was measured while it trained.")
         except ValueError as error:
-            missing.append(f"{label}: no CA and PSNR against the step: {error}")
+            missing.append(f"{gap}: {error}")
         else:
             for group in (key[3:] for key in columns if key.startswith("ca/")):
-                curve: dict[str, Any] = {"run": label, "group": group, "step": columns["step"].tolist()}
+                curve: dict[str, Any] = {"run": run.label, "group": group, "step": columns["step"].tolist()}
                 for name, unit in (("ca", 1e-3), ("psnr", 1.0)):
                     values = columns.get(f"{name}/{group}", np.full(len(columns["step"]), np.nan)) / unit
                     # None, as JSON has no nan.
@@ -410,16 +424,16 @@ def _unseen(found: Sequence[Findings]) -> list[dict[str, Any]]:
     return entries
 
 
-def _hanging(each: Findings, run: Path, options: SceneOptions) -> list[str]:
+def _hanging(each: Findings, run: _Run) -> list[str]:
     """Return lines on what hung where nobody took a photograph, what still hangs there, and how to remove it."""
     lines = [f"{each.label}: {line}" for line in each.removed]
     if each.hangs is None:
         return lines
-    if not (run / PLY).exists():
+    if not (run.folder / PLY).exists():
         return [*lines, f"{each.label}: {each.hangs} They can be removed once it has been trained to its end."]
-    command = ["ca-reg", "clean", str(run / PLY), "--scene", options.path, "--hanging"]
+    command = ["ca-reg", "clean", str(run.folder / PLY), "--scene", run.options.path, "--hanging"]
     for name, usual in dataclasses.asdict(SceneOptions()).items():
-        if (x := getattr(options, name)) != usual and name not in ("path", "init"):  # a PLY is its own beginning
+        if (x := getattr(run.options, name)) != usual and name not in ("path", "init"):  # a PLY is its own beginning
             flag = name.replace("_", "-")
             command += [f"--{flag}" if x else f"--no-{flag}"] if isinstance(x, bool) else [f"--{flag}", str(x)]
     return [*lines, f"{each.label}: {each.hangs} To remove them: {shlex.join(command)}"]
