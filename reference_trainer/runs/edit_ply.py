@@ -148,18 +148,18 @@ def clean_ply(
     model, scene = loaded.model, loaded.scene
     if model.for_rendering:
         raise ValueError(f"the opacities of {ply} are those of the test: give the PLY with plain ones.")
-    if hanging and scene is None:
-        raise ValueError("what hangs is found between and beyond the cameras of a scene: give --scene FOLDER.")
-    if model.chain.drops and not (anyway or hanging):
+    if hanging:
+        if scene is None:
+            raise ValueError("what hangs is found between and beyond the cameras of a scene: give --scene FOLDER.")
+        hung = guard(model, scene)
+        _log.info("%s", hung)
+        stays = hung.keep
+    elif model.chain.drops and not anyway:
         raise ValueError(
             f"{ply} was trained with {model.regularizer}, which leaves little to remove: cleaning such a model made it "
             "worse (fern, 24.21 to 23.80 dB at the test views). Keep it as it is, remove what hangs where nobody was "
             "(--hanging), or say --anyway."
         )
-    if hanging and scene is not None:
-        found_hanging = guard(model, scene)
-        _log.info("%s", found_hanging)
-        stays = found_hanging.keep
     else:
         views = [view.to(device) for view in loaded.views["orbit" if scene is None else "train"]]
         stays = all_but_highest(Heat.of(model, views).values, fraction)

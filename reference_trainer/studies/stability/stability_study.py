@@ -184,19 +184,13 @@ def _worst_errors(record: Record) -> dict[str, float]:
     return worst
 
 
-def _engines(records: Records) -> list[str]:
-    return list(dict.fromkeys(record["engine"] for record in records.values() if record["engine"]))
-
-
-def _of_engine(records: Sequence[Record], engine: str) -> list[Record]:
-    """Return the records of an engine and those without one."""
-    return [record for record in records if record["engine"] in (engine, None)]
-
-
 def _report(records: Records) -> str:
     """Return the counts, the errors by case and quantity, and the cases that end."""
     cases, about = [*records.values()], machine()
-    endings = {engine: Counter(case["ending"] for case in _of_engine(cases, engine)) for engine in _engines(records)}
+    endings = {
+        engine: Counter(case["ending"] for case in cases if case["engine"] in (engine, None))
+        for engine in dict.fromkeys(case["engine"] for case in cases if case["engine"])
+    }
     columns = ["engine", "cases", "ok", "refused", "limit", "defect"]
     rows = [
         {**dict.fromkeys(columns, 0), "engine": engine, "cases": counts.total(), **counts}
