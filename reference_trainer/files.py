@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["is_ply", "remove_leftovers", "replacing", "write_text"]
+__all__ = ["has_mark", "is_ply", "remove_leftovers", "replacing", "write_text"]
 
 _PART = ".part"
 
@@ -58,6 +58,14 @@ def write_text(path: str | Path, text: str) -> None:
     """
     with replacing(path) as place:
         place.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def has_mark(file: Path, mark: bytes, within: int = -1) -> bool:
+    """Whether this program wrote a file: whether it is there with ``mark`` in its first ``within`` bytes, or in all."""
+    if not file.is_file():
+        return False
+    with file.open("rb") as content:
+        return mark in content.read(within)
 
 
 def remove_leftovers(folder: str | Path, *, below: bool = True) -> None:

@@ -118,8 +118,8 @@ class Render:
         from reference_trainer.runs.measure import render_run
 
         self.rendering.begin(self.device)
-        shared: dict[str, Any] = {"mask": self.mask, "device": self.device, "trust": self.trust}
-        render_run(self.run, self.what, self.out, frames=60 if self.frames is None else self.frames, **shared)
+        frames = 60 if self.frames is None else self.frames
+        render_run(self.run, self.what, self.out, frames=frames, mask=self.mask, device=self.device, trust=self.trust)
 
 
 @dataclass(frozen=True)

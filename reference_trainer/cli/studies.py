@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -38,8 +38,10 @@ class ErrorRuntime:
         from reference_trainer.studies.error_runtime import error_runtime_study
         from reference_trainer.studies.study import run_study
 
-        how: dict[str, Any] = {"max_samples": self.max_samples, "seeds": self.seeds, "device": self.device}
-        run_study(error_runtime_study(self.sources, trust=self.trust, **how), self.out)
+        study = error_runtime_study(
+            self.sources, max_samples=self.max_samples, seeds=self.seeds, device=self.device, trust=self.trust
+        )
+        run_study(study, self.out)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from torch.nn.functional import pad
 
 from ca_reg.monitor import LOG_NAME, plot_dynamics
 from reference_trainer.evaluation.style import WIDTH, color, in_thousandths, new_figure, readable
-from reference_trainer.files import replacing
+from reference_trainer.files import has_mark, replacing
 from reference_trainer.scenes.images import IMAGE_SUFFIXES, read_image
 
 __all__ = [
@@ -80,10 +80,8 @@ def save_png(path: str | Path, image: Tensor) -> None:
 
 def is_own_png(path: Path) -> bool:
     """Whether a picture is from `save_png`, or there is none: what may be overwritten without asking."""
-    if not path.exists():
-        return True
-    with path.open("rb") as file:  # the text is the first thing after the size, and nothing has to be decoded
-        return b"Software\0" + _MADE_BY.encode() in file.read(200)
+    # The text is the first thing after the size, and nothing has to be decoded.
+    return not path.exists() or has_mark(path, b"Software\0" + _MADE_BY.encode(), within=200)
 
 
 def save_film(folder: Path, name: str, images: Sequence[Tensor]) -> Path:
@@ -228,9 +226,7 @@ def dynamics_figure(runs: Mapping[str, Path], path: Path) -> None:
         figure.set_size_inches(WIDTH, 4.4)
         colors = {label: color(label, number) for number, label in enumerate(runs)}
         ca_axes, psnr_axes = plot_dynamics(dict(runs), axes=figure.subplots(1, 2), colors=colors)
-        exact = [logs_exact(folder) for folder in runs.values()]
-        old = "CA; exact, or of 5 renders" if any(exact) else "CA"  # logs of older versions hold the sampled score
-        in_thousandths(ca_axes.yaxis, "exact CA" if all(exact) else old)
+        in_thousandths(ca_axes.yaxis, "exact CA" if all(map(logs_exact, runs.values())) else "CA")
         ca_axes.set_title("Co-adaptation")
         psnr_axes.set_title("Quality")
         if (beside := psnr_axes.get_legend()) is not None:
@@ -257,7 +253,7 @@ def comparison_figure(runs: Mapping[str, Path], path: Path, *, view: str, split:
 
 
 def _of_one_size(images: Sequence[Tensor]) -> Iterator[Tensor]:
-    """Yield pictures (3, H, W) with white margins, where labels, or versions, made some of them smaller."""
+    """Yield pictures (3, H, W) with white margins, where labels made some of them smaller."""
     height, width = (max(image.shape[axis] for image in images) for axis in (1, 2))
     for image in images:
         yield pad(image, (0, width - image.shape[2], 0, height - image.shape[1]), value=1.0)

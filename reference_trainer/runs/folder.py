@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from reference_trainer.files import has_mark
 from reference_trainer.json_files import read_json, settings_from
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.config import TrainConfig, saved_config
@@ -158,7 +159,7 @@ def check_output(folder: Path, scene: str | Path | None, files: Collection[str])
 
 def is_own_plan(file: Path) -> bool:
     """Whether a file is a plan of this program."""
-    return file.is_file() and '"items"' in file.read_text("utf-8", "ignore")
+    return has_mark(file, b'"items"')
 
 
 def check_writable(folder: Path) -> None:
@@ -217,10 +218,8 @@ def report_file(runs: Sequence[Path], out: Path | None = None) -> Path:
         raise ValueError(f"{out} is a folder: --out is the file to write, such as {out / 'report.html'}.")
     file = out or Path(os.path.commonpath([run.absolute() for run in runs])) / "report.html"
     check_writable(file.parent)
-    if file.exists():
-        with file.open("rb") as content:
-            if _OWN_PAGE not in content.read(1_000):
-                raise ValueError(f"{file} is no report of ca-reg and is not overwritten: give another --out.")
+    if file.exists() and not has_mark(file, _OWN_PAGE, within=1_000):
+        raise ValueError(f"{file} is no report of ca-reg and is not overwritten: give another --out.")
     return file
 
 

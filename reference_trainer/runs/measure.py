@@ -19,7 +19,7 @@ from reference_trainer.evaluation.pictures import PANEL, file_names, is_own_png,
 from reference_trainer.evaluation.results import PARTIAL, machine, write_json
 from reference_trainer.evaluation.tables import evaluation_table
 from reference_trainer.evaluation.trained_model import TrainedModel
-from reference_trainer.files import remove_leftovers, write_text
+from reference_trainer.files import has_mark, remove_leftovers, write_text
 from reference_trainer.runs.folder import VIEWS, check_output, run_lock
 from reference_trainer.runs.run import load_run, model_of
 from reference_trainer.scenes.scene import Scene, Viewpoint
@@ -73,7 +73,7 @@ def measure(
         ValueError: if ``out`` holds files of these names that are not from here.
     """
     # A folder with an earlier measurement is ours; in any other, files of these names are somebody else's.
-    ours = (out / PARTIAL).exists() or _is_evaluation(out / EVALUATION)
+    ours = (out / PARTIAL).exists() or has_mark(out / EVALUATION, b'"ca_settings"')
     check_output(out, None, () if ours else (EVALUATION, "evaluation.md", VIEWS))
     partial = out / PARTIAL
     largest = max(view.camera.width * view.camera.height for of in views.values() for view in of)
@@ -97,11 +97,6 @@ def measure(
     _log.info(table)
     _log.info("Scores and pictures are in %s", out)
     return result
-
-
-def _is_evaluation(file: Path) -> bool:
-    """Whether a file is an evaluation of this program."""
-    return file.is_file() and '"ca_settings"' in file.read_text("utf-8", "ignore")
 
 
 def _remove_other_pictures(folder: Path, views: Mapping[str, Sequence[Viewpoint]]) -> None:

@@ -8,7 +8,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -123,8 +122,7 @@ def load_plain_ply_model(
     ply: Path, *, regularizer: str | None = None, device: str = "cpu", trust: Collection[str] = ()
 ) -> tuple[TrainedModel, PlyFacts]:
     """Do as `load_ply_model` over black, with a ValueError unless the opacities are plain."""
-    shared: dict[str, Any] = {"regularizer": regularizer, "device": device, "trust": trust}
-    model, facts = load_ply_model(ply, background=torch.zeros(3), **shared)
+    model, facts = load_ply_model(ply, background=torch.zeros(3), regularizer=regularizer, device=device, trust=trust)
     if facts.for_rendering or facts.opacity_scale != 1:
         by = "those of the test" if facts.for_rendering else f"scaled by {facts.opacity_scale:g}"
         raise ValueError(f"the opacities of {ply} are {by} already: give the PLY with plain ones.")
@@ -208,8 +206,9 @@ def score_ply(
     # Folders of their own, or the scores at other views or of another regularizer would take each other's place.
     kind = ["orbit"] * (scene is None) + [folder_name(x) for x in (regularizer,) if x is not None]
     folder = out or ply.with_name("_".join([ply.stem, "evaluation", *kind]))
-    shared: dict[str, Any] = {"samples": samples, "seed": seed, "perceptual": perceptual}
-    result = measure(loaded.model, loaded.views, folder, about=loaded.about, **shared)
+    result = measure(
+        loaded.model, loaded.views, folder, about=loaded.about, samples=samples, seed=seed, perceptual=perceptual
+    )
     log_what_hangs(loaded.model, scene, folder)
     if scene is None:
         _log.info(

@@ -104,6 +104,7 @@ def all_cases() -> tuple[Case, ...]:
     return (*_geometry_cases(), *_blend_cases())
 
 
+_STRAIGHT = Camera(torch.eye(4, dtype=torch.float64), 40.0, 38.0, 15.0, 12.7, 32, 24)  # looks along world z
 _SHAPE, _PLACE, _CAMERA = "shape and size", "place", "camera and image"
 _RATIOS = (2.0, *decades(1, 8))
 _FOCALS = (1.0, 10.0, *decades(2, 6))
@@ -186,8 +187,7 @@ def _replaced(point: Tensor, scale: float, scene: StressScene) -> Probe:
 
 def _at_depth(depth: float) -> Probe:
     """Put a Gaussian near the optical axis; the camera looks along world z, so that no rotation rounds its depth."""
-    camera = Camera(torch.eye(4, dtype=torch.float64), 40.0, 38.0, 15.0, 12.7, 32, 24)
-    scene = base_scene(camera=camera)
+    scene = base_scene(camera=_STRAIGHT)
     ahead = scene.means + torch.tensor([0.0, 0, 3], dtype=torch.float64)
     return _replaced(torch.tensor([0.01, -0.02, depth], dtype=torch.float64), 0.02, replace(scene, means=ahead))
 
@@ -234,7 +234,7 @@ def _offset(offset: float) -> Probe:
 
 def _telephoto(focal: float) -> Probe:
     """Shrink the scene across the optical axis as the focal length grows, so that it fills the image."""
-    scene = base_scene(camera=Camera(torch.eye(4, dtype=torch.float64), focal, focal, 15.0, 12.7, 32, 24))
+    scene = base_scene(camera=replace(_STRAIGHT, fx=focal, fy=focal))
     # 40 is the focal length of the base scene, which fills the image.
     across = torch.tensor([40.0 / focal, 40.0 / focal, 1.0], dtype=torch.float64)
     means = scene.means * across + torch.tensor([0.0, 0, 3], dtype=torch.float64)
@@ -333,8 +333,7 @@ def _stacked(opacity: float, count: float) -> Probe:
 
 def _one_plane() -> Probe:
     """Put all Gaussians at one depth: they must be rendered in storage order."""
-    camera = Camera(torch.eye(4, dtype=torch.float64), 40.0, 38.0, 15.0, 12.7, 32, 24)
-    scene = base_scene(camera=camera)
+    scene = base_scene(camera=_STRAIGHT)
     return of_scene(replace(scene, means=torch.cat([scene.means[:, :2], torch.full((24, 1), 3.0).double()], dim=1)))
 
 
