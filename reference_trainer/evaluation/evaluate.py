@@ -178,11 +178,12 @@ def _measure(
     files: Sequence[Path],
 ) -> ViewScores:
     """Measure one view, and write its render and its panel if ``files`` names them."""
-    photograph, mask, truth = (view.image, view.mask, view.depth) if isinstance(view, View) else (None, None, None)
-    out = model.test_rendering(view, depth=truth is not None)
-    image, quality = out.image.clamp(0, 1), dict.fromkeys(("psnr", "ssim", "lpips"), math.nan)
+    photograph = mask = truth = None
     if isinstance(view, View):
-        image, photograph = view.as_taken(out.image).clamp(0, 1), view.as_taken(view.image)
+        photograph, mask, truth = view.as_taken(view.image), view.mask, view.depth
+    out = model.test_rendering(view, depth=truth is not None)
+    image = (view.as_taken(out.image) if isinstance(view, View) else out.image).clamp(0, 1)
+    quality = dict.fromkeys(("psnr", "ssim", "lpips"), math.nan)
     if photograph is not None and counted(photograph, mask).numel():
         pair = on_white(image, mask), on_white(photograph, mask)
         quality |= {"psnr": psnr(image, photograph, mask), "ssim": ssim(*pair)}
@@ -221,8 +222,8 @@ def _measure(
         panels: list[tuple[str, Tensor, tuple[str, str] | None]]  # title, picture, ends of its color bar
         panels = [(_titled("render", measured.psnr, "{:.2f} dB"), image, None)]
         if photograph is not None:
-            error = "error", error_picture(image, photograph), of_errors
-            panels = [("photograph", photograph, None), *panels, error]
+            panels.insert(0, ("photograph", photograph, None))
+            panels.append(("error", error_picture(image, photograph), of_errors))
         else:
             if exact is not exact_half:
                 maps[f"exact CA{_at(exact)}"] = exact

@@ -37,9 +37,10 @@ class Quantity(NamedTuple):
     unit: float = 1.0
     highest_is_best: bool | None = None  # None where neither end is a merit
 
-    def text(self, values: Iterable[float]) -> str:
-        """Return mean and standard deviation, see `format_mean_std`."""
-        return format_mean_std(values, unit=self.unit, decimals=self.decimals)
+    def text(self, values: Iterable[float | None]) -> str:
+        """Return mean and standard deviation, see `format_mean_std`; None is nan, which JSON does not have."""
+        known = (math.nan if value is None else value for value in values)
+        return format_mean_std(known, unit=self.unit, decimals=self.decimals)
 
 
 QUANTITIES = {
@@ -116,14 +117,11 @@ def comparison_table(runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     for strategy, of in runs.items():
         row: dict[str, object] = {"strategy": strategy, "seeds": len(of)}
         for title, (split, name) in columns.items():
-            values = [run["mean"].get(split, {}).get(name) for run in of]
-            if any(value is not None for value in values):
-                found = [math.nan if value is None else value for value in values]  # JSON has no nan
-                row[title] = QUANTITIES[name].text(found)
+            row[title] = QUANTITIES[name].text(run["mean"].get(split, {}).get(name) for run in of)
         for name in ("gaussians", "seconds"):
             row[QUANTITIES[name].title] = QUANTITIES[name].text([run[name] for run in of])
         rows.append(row)
-    present = [title for title in columns if any(title in row for row in rows)]
+    present = [title for title in columns if any(row[title] != _ABSENT for row in rows)]
     return markdown_table(rows, ["strategy", "seeds", *present, "Gaussians", "seconds"])
 
 

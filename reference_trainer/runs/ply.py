@@ -172,8 +172,9 @@ def load_for_views(
     if isinstance(where, OrbitOptions):
         return _on_orbit(model, where, about)
     assert scene is not None
-    for doubt in [*check_frame(model.gaussians, scene, ply), *_other_size(ply, scene)]:
+    for doubt in check_frame(model.gaussians, scene, ply):
         _log.info(doubt)
+    _log_other_size(ply, scene)
     return ModelWithViews(model, 1.0, measured_views(scene), scene, about | {"scene": scene.name})
 
 
@@ -291,19 +292,19 @@ def log_other_center(model: TrainedModel, scene: Scene, ply: Path) -> None:
         )
 
 
-def _other_size(ply: Path, scene: Scene) -> list[str]:
-    """Return a note if the PLY lies in a run whose training views were larger or smaller than those of the scene."""
+def _log_other_size(ply: Path, scene: Scene) -> None:
+    """Log it if the PLY lies in a run whose training views were larger or smaller than those of the scene."""
     for view, name in zip(scene.train, file_names([view.name for view in scene.train]), strict=True):
         file = ply.parent / VIEWS / "train" / f"{name}.png"
         if file.is_file() and is_own_png(file):
             (width, height), camera = image_size(file), view.camera
-            if (width, height) == (camera.width, camera.height):
-                return []
-            return [
-                f"{ply} was trained at {width}x{height}, the size of its pictures in {file.parent}, and is measured "
-                f"at {camera.width}x{camera.height}: its own scores are no comparison. --downscale gives its size."
-            ]
-    return []
+            if (width, height) != (camera.width, camera.height):
+                _log.info(
+                    f"{ply} was trained at {width}x{height}, the size of its pictures in {file.parent}, and is "
+                    f"measured at {camera.width}x{camera.height}: its own scores are no comparison. --downscale gives "
+                    "its size."
+                )
+            return
 
 
 NEARLY_NONE = 0.01
