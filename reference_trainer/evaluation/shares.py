@@ -103,14 +103,8 @@ def guard(model: TrainedModel, scene: Scene, views: Sequence[Viewpoint] | None =
     What hangs is left out and the rest measured again, because it may have hidden more, until nothing hangs or
     ``rounds`` are over. All `unseen_views` are judged together. With many training cameras each of `amid_views` is
     also judged separately, because what hangs at one of many places is little in the mean over all. Scores are at the
-    drop rate of the training, at 0.2 if that is 0. No photograph is looked at. Costs about four renders
-    per camera and round.
-
-    Args:
-        model: which, trained with something that drops or is noisy.
-        scene: with its training cameras.
-        views: cameras that nobody took in the place of all `unseen_views`.
-        rounds: how often to measure again, at most.
+    drop rate of the training, at 0.2 if that is 0. No photograph is looked at. ``views`` are cameras that nobody took
+    in the place of all `unseen_views`. Costs about four renders per camera and round.
 
     Raises:
         ValueError: if the model was trained without anything that drops or is noisy, whose Gaussians need each other,

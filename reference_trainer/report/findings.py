@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
 from ca_reg import CAResult, Reason
@@ -43,7 +42,6 @@ class Findings:
     Args:
         label: what the page calls it.
         model: at its last checkpoint.
-        opacities: that the page renders it with, (N,).
         scene: what it was trained on.
         views: that it is shown from, by split, those that were not trained on first if they have photographs.
         pictures: per view, ``"render"`` and where they exist ``"error"``, ``"expected error"`` and ``"co-adaptation"``,
@@ -58,16 +56,15 @@ class Findings:
 
     label: str
     model: TrainedModel
-    opacities: Tensor
     scene: Scene
     views: Mapping[str, Sequence[Viewpoint]]
     pictures: list[dict[str, str]]
     heat: Heat | None
     notes: list[str]
-    unseen: Sequence[tuple[Viewpoint, ErrorMap]] = ()
-    hangs: str | None = None
-    removed: Sequence[str] = ()
-    veils: Mapping[str, str] = field(default_factory=dict)
+    unseen: Sequence[tuple[Viewpoint, ErrorMap]]
+    hangs: str | None
+    removed: Sequence[str]
+    veils: Mapping[str, str]
 
     def packed(self, low: float, high: float) -> dict[str, Any]:
         """Return the model as the page renders it: its Gaussians in the order of their heat, those of least heat first.
@@ -75,11 +72,8 @@ class Findings:
         ``values`` are `quantized` columns: the position (3) less ``center``, in units of ``scale`` and as
         sign(x) log(1 + |x|), the logarithm of the scales (3), the quaternion (4, wxyz), opacity, color of the heat (3),
         and the coefficients of the spherical harmonics, ((degree + 1)^2, 3). ``held`` is the fraction of the score held
-        by the 0, 1, ... 100 % of the Gaussians of most heat.
-
-        Args:
-            low: share per weight of the darkest color.
-            high: share per weight of the brightest color.
+        by the 0, 1, ... 100 % of the Gaussians of most heat. ``low`` and ``high`` are the shares per weight of the
+        darkest and the brightest color.
         """
         order, n = torch.arange(len(self.model.gaussians)), len(self.model.gaussians)
         heat, held = torch.full((n, 3), 0.5), list[float]()
@@ -99,7 +93,7 @@ class Findings:
             (means.sign() * (means / scale).abs().log1p(), 2e-4),
             (gaussians.log_scales, 0.02),
             (normalize(gaussians.quaternions, dim=1), 1 / 256),
-            (self.opacities.cpu()[order][:, None], 1 / 512),
+            (self.model.without_camera.test_opacities.cpu()[order][:, None], 1 / 512),
             (heat, 1 / 255),
             (gaussians.sh[:, 0], 1 / 128),  # a quarter of a gray level
             (gaussians.sh[:, 1 : (degree + 1) ** 2].flatten(1), 1 / 36),  # an error of 2 gray levels
@@ -130,17 +124,8 @@ class Findings:
 def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Collection[str] = ()) -> Findings:
     """Render a run's last checkpoint from its views, and attribute the exact score at drop rate 1/2 to its Gaussians.
 
-    The expected error follows from the model and the training photographs, so these have none themselves.
-
-    Args:
-        run: its folder.
-        label: what the page calls it.
-        views: how many of each split, evenly spaced.
-        device: where to render.
-        trust: as for `load_run`.
-
-    Raises:
-        FileNotFoundError: if the folder holds no run.
+    The expected error follows from the model and the training photographs, so these have none themselves. Of each split
+    so many ``views`` are shown, evenly spaced; ``trust``, and errors, are as for `load_run`.
     """
     model, scene = load_run_model(run, device, trust=trust)
     notes: list[str] = []
@@ -173,8 +158,7 @@ def find(run: Path, label: str, *, views: int, device: str = "cpu", trust: Colle
             hangs, veils["what hangs there"] = str(still), image_uri(hanging_picture(model, scene, still))
     else:
         notes.append(f"{label}: no views that you did not take, because none lies between or beyond a single camera.")
-    opacities = model.without_camera.test_opacities
-    return Findings(label, model, opacities, scene, chosen, pictures, heat, notes, unseen, hangs, removed, veils)
+    return Findings(label, model, scene, chosen, pictures, heat, notes, unseen, hangs, removed, veils)
 
 
 @torch.no_grad()

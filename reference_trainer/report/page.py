@@ -90,13 +90,10 @@ def write_report(
 ) -> Path:
     """Write a page about runs on one scene that opens without a server or a network.
 
-    It begins with a verdict and its evidence, and shows the scores with their differences to the first run, CA and PSNR
-    against the step, every model in 3D (all turn together) in its colors or its co-adaptation heat, any two of
-    photograph, render, error, expected error and CA map of all runs on top of each other, the views that nobody took
-    with the lowest expected PSNR, what hangs there, and how concentrated the score is on few Gaussians. Runs come in
-    the order baseline, dropout, noise, both, under natural names. The heat is the share of the exact score at drop rate
-    1/2 per blend weight, over the views of the page, on one logarithmic scale for all runs around the mean of the first
-    run that has one. What a run lacks is left out, and the page says so.
+    It begins with a verdict and its evidence; docs/report.md says what else it shows. Runs come in the order baseline,
+    dropout, noise, both, under natural names. The heat is the share of the exact score at drop rate 1/2 per blend
+    weight, over the views of the page, on one logarithmic scale for all runs around the mean of the first run that has
+    one. What a run lacks is left out, and the page says so.
 
     Args:
         runs: their folders, finished or not; the folder of a comparison stands for the first seed of each strategy, and

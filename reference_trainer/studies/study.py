@@ -63,13 +63,8 @@ def run_study(study: Study, out: Path, *, executor: Executor | None = None) -> R
     Every record is on disk, in ``NAME.records.json``, as soon as its case is measured. Later calls reuse it as long as
     the settings, the files among them and the result of `machine` are the same; other cases may come and go.
 
-    Args:
-        study: the declaration.
-        out: folder for the results.
-        executor: where to measure, several cases at a time; None for this process, one after the other.
-
-    Returns:
-        The records.
+    They go into the folder ``out``. An ``executor`` measures several cases at a time; without one this process measures
+    one after the other.
 
     Raises:
         ValueError: if there is no case, or what ``study.measure`` raises.
