@@ -244,8 +244,8 @@ class Compare:
     """Train baseline, dropout, noise and both, with several seeds.
 
     One table per scene with mean and spread. Finished runs are kept: the same command continues an interrupted
-    comparison, or adds strategies or seeds. A run that fails is reported at the end and does not stop the others; the
-    exit code is then 1.
+    comparison, or adds strategies or seeds. A run that fails, or a page, is reported at the end and does not stop the
+    others; the exit code is then 1.
     """
 
     out: Path
@@ -322,8 +322,13 @@ class Compare:
         trust = set[str]().union(*map(modules_named, (self.scene, *chosen.values())))  # named on this command line
         # The pages are written here, where the machines of a cluster may have cards and this one none.
         here = self.device if not self.elsewhere else "cpu"
+        failed = any(comparison.failures for comparison in comparisons.values())
         # Where every run failed there is nothing to show.
         for folder in [folder for folder, comparison in comparisons.items() if comparison.runs]:
-            write_report([folder], device=here, trust=trust)
-        if any(comparison.failures for comparison in comparisons.values()):
+            try:
+                write_report([folder], device=here, trust=trust)
+            except ValueError as error:  # of a run from before, of another scene or with code not named here
+                print(f"ca-reg: no page, for which there is ca-reg report {folder}: {error}", file=sys.stderr)
+                failed = True
+        if failed:
             sys.exit(1)

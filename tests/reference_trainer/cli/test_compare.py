@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from reference_trainer.cli import main
+from reference_trainer.report import page as page_module
 from reference_trainer.runs import compare as compare_module
 from reference_trainer.runs import executors as choice_module
 from reference_trainer.runs.compare import Comparison
@@ -60,3 +61,24 @@ def test_several_scenes_and_how_they_are_run(monkeypatch, tmp_path):
         tmp_path / "synthetic": SceneOptions("synthetic", downscale=2.0),
     }
     assert (asked["running"].retries, asked["running"].monitoring.checkpoint_every) == (1, 50)
+
+
+def test_a_page_that_is_refused_does_not_stop_the_others(capsys, monkeypatch, tmp_path):
+    """A run that was there before may be of another scene, or of code that this command line does not name."""
+    pages = []
+
+    def fake(folders, **options):
+        if folders == [tmp_path / "fern"]:
+            raise ValueError("If it is yours, say --trust mine.")
+        pages.extend(folders)
+
+    found = {tmp_path / name: Comparison({"baseline": []}, {}) for name in ("fern", "lego")}
+    monkeypatch.setattr(compare_module, "compare", lambda *a: found)
+    monkeypatch.setattr(compare_module, "report", lambda comparisons: None)
+    monkeypatch.setattr(page_module, "write_report", fake)
+    with pytest.raises(SystemExit) as exit_:
+        main(["compare", "--out", str(tmp_path)])
+    assert (exit_.value.code, pages) == (1, [tmp_path / "lego"])
+    said = capsys.readouterr().err
+    assert "--trust mine" in said
+    assert f"ca-reg report {tmp_path / 'fern'}" in said
