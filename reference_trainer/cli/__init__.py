@@ -44,11 +44,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _run(arguments: Sequence[str]) -> None:
     try:
         command = parse_command(arguments)
-        computing = command.what if isinstance(command, Study) else command
-        if hasattr(computing, "check"):  # refuses what cannot work, before anything heavy is imported
-            computing.check()
-        if hasattr(computing, "device"):
-            check_device(computing.device, here=not (isinstance(command, Compare) and command.elsewhere))
+        if hasattr(command, "check"):  # refuses what cannot work, before anything heavy is imported
+            command.check()
+        if hasattr(command, "device"):
+            check_device(command.device, here=not (isinstance(command, Compare) and command.elsewhere))
         command()
     except BrokenPipeError:  # the reader of the output, such as head, has stopped reading
         # Python flushes the output once more when it exits, which must not fail again.
@@ -136,7 +135,7 @@ def parse_command(arguments: Sequence[str]) -> Any:
     heard = io.StringIO()
     try:
         with contextlib.redirect_stderr(heard):
-            return tyro.cli(
+            command = tyro.cli(
                 commands,
                 prog="ca-reg",
                 description="Measure and remove co-adaptation in sparse-view 3D Gaussian Splatting.",
@@ -146,6 +145,7 @@ def parse_command(arguments: Sequence[str]) -> Any:
             )
     except SystemExit as end:
         raise _in_a_line(heard.getvalue(), arguments) or end from None
+    return command.what if isinstance(command, Study) else command
 
 
 def _similar_options(heard: str, given: str) -> dict[str, list[str]]:

@@ -63,6 +63,3 @@ class Study:
 
     # tyro makes a command of every member.
     what: ErrorRuntime | Stability
-
-    def __call__(self) -> None:
-        self.what()

@@ -210,8 +210,9 @@ def _table(found: dict[str, Evaluation]) -> str:
     for name, evaluation in found.items():
         row: dict[str, object] = {"model": name, "Gaussians": evaluation.gaussians}
         for split in dict.fromkeys(view.split for view in evaluation.views):
-            for name in ("psnr", "ca_exact_half"):
-                row[f"{split} {QUANTITIES[name].title}"] = QUANTITIES[name].text([evaluation.mean(split, name)])
+            for quantity in ("psnr", "ca_exact_half"):
+                shown = QUANTITIES[quantity]
+                row[f"{split} {shown.title}"] = shown.text([evaluation.mean(split, quantity)])
         rows.append(row)
     known = [title for title in rows[0] if any(row[title] != "n/a" for row in rows)]
     return markdown_table(rows, known)

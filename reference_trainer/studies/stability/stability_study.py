@@ -278,8 +278,9 @@ def _label(of: Sequence[Record]) -> str:
     if not magnitudes:
         return str(name)
     onsets = [record["onset"] for record in of if record["onset"] is not None]
-    mantissa, exponent = f"{min(onsets) if onsets else magnitudes[1]:.1e}".split("e")
+    last = min(onsets) if onsets else magnitudes[1]
+    mantissa, exponent = f"{last:.1e}".split("e")
     number = ("" if mantissa == "1.0" else rf"{mantissa} \times ") + f"10^{{{int(exponent)}}}"
     if 0 <= int(exponent) < 3:  # shorter in full
-        number = f"{min(onsets) if onsets else magnitudes[1]:.3g}"
+        number = f"{last:.3g}"
     return f"{name}{'; ends at' if onsets else ', to'} ${number}$"
