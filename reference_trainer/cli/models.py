@@ -278,8 +278,9 @@ class Clean:
     """A standard 3DGS PLY, opacities plain."""
     scene: ModelScene = field(default_factory=PlyScene)
     orbit: Orbit = field(default_factory=OrbitOptions)
-    fraction: float = 0.1
-    """Fraction of the Gaussians to remove."""
+    # None, not 0.1, so that `check` can refuse it where it has no effect.
+    fraction: float | None = None
+    """Fraction of the Gaussians to remove, by default 0.1."""
     hanging: bool = False
     """Remove instead what hangs where nobody took a photograph; for models trained with dropout or noise."""
     refine: int | None = None
@@ -296,6 +297,8 @@ class Clean:
 
     def check(self) -> None:
         options.check_ply(self.ply)
+        if self.hanging and self.fraction is not None:
+            raise ValueError(f"--hanging removes all that hangs: leave out --fraction {self.fraction:g}, or --hanging.")
         where = scene_or_orbit(self.ply, self.scene, self.orbit)
         if self.refine and isinstance(where, OrbitOptions):
             raise ValueError(f"--refine {self.refine} needs photographs: give --scene FOLDER.")
@@ -312,12 +315,12 @@ class Clean:
             self.ply,
             where,
             self.out or self.ply.with_name(f"{self.ply.stem}_clean.ply"),
-            fraction=self.fraction,
+            fraction=0.1 if self.fraction is None else self.fraction,
             refine=self.refine,
             hanging=self.hanging,
             background=self.scene.background,
             regularizer=self.regularizer,
             anyway=self.anyway,
             device=self.device,
-            trust={*self.trust, *modules_named(self.regularizer or "")},
+            trust=self.trust,
         )

@@ -233,6 +233,7 @@ def test_an_unknown_scene(capsys, tmp_path):
         (["view", "run", "--background", "white"], "run is no PLY, and a run is looked at on its own scene"),
         (["clean", "a.ply", "--views", "3"], "without photographs no option of a scene but --background"),
         (["clean", "a.ply", "--refine", "5"], "--refine 5 needs photographs"),
+        (["clean", "a.ply", "--hanging", "--fraction", "0.2"], "leave out --fraction 0.2"),
         (["compare", "--regularizer", "d2gs"], "--strategies says what is compared"),
         (["compare", "--analytic", "--dropout", "0.2"], "--strategies says what is compared"),
         (["evaluate", "a.ply", "--background", "red"], "background must be auto, black or white, got 'red'"),
