@@ -20,7 +20,7 @@ from typing import Any
 from reference_trainer.files import has_mark
 from reference_trainer.json_files import read_json, settings_from
 from reference_trainer.scenes.options import SceneOptions
-from reference_trainer.training.config import TrainConfig, saved_config
+from reference_trainer.training.config import TrainConfig
 
 __all__ = [
     "BAKED_PLY", "CHECKPOINT", "COMPARISON", "CONFIG", "GUARD", "GUARD_PICTURE", "LOCK", "MEMBERS", "PLAN", "PLY",
@@ -84,7 +84,7 @@ def read_run_settings(path: str | Path) -> tuple[SceneOptions, TrainConfig]:
     if not isinstance(content, dict) or not {"scene", "config"} <= content.keys():
         raise ValueError(f"{path} is not the config.json of a run: it must hold the objects 'scene' and 'config'.")
     scene = settings_from(SceneOptions, content["scene"], f"{path}, scene")
-    config = saved_config(content["config"], f"{path}, config")
+    config = settings_from(TrainConfig, content["config"], f"{path}, config")
     place, here = Path(scene.path), Path(path).parent
     run = here.parents[1] if here.parent.name == MEMBERS else here
     if place.parent.name == SCENE and (own := run / SCENE / place.name).is_dir():

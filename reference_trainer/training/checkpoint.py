@@ -14,11 +14,12 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from reference_trainer.files import replacing
+from reference_trainer.json_files import settings_from
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians
 from reference_trainer.scenes.scene import Scene
 from reference_trainer.tensor_files import load_tensors, moved
 from reference_trainer.training.assembly import make_density, make_regularizer
-from reference_trainer.training.config import TrainConfig, saved_config
+from reference_trainer.training.config import TrainConfig
 
 __all__ = ["TrainingState", "fingerprints", "load_checkpoint", "read_state", "save_checkpoint"]
 
@@ -66,7 +67,7 @@ def fingerprints(scene: Scene) -> dict[str, Tensor]:
 
 
 _TIMES = ("seconds", "processor_seconds")
-_ENTRIES = ("format", "config", "scene", "train_views", "step", *_TIMES)
+_ENTRIES = ("format", "config", "scene", "train_views", "fingerprints", "step", *_TIMES)
 _OF_A_MODEL = ("statistics", "regularizer", "gaussians", "moments")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
@@ -104,16 +105,14 @@ def read_state(
 
 def _read(state: dict[str, Any], scene: Scene, where: Path, refuse: Callable[[TrainConfig], None]) -> TrainingState:
     """Read a state; wrong types that are not checked for raise TypeError, AttributeError or LookupError."""
-    # Checkpoints of one model have no others, older ones no fingerprints.
-    optional = [name for name in ("others", "fingerprints") if name in state]
-    _refuse_other_entries(state, (*_ENTRIES, *_OF_A_MODEL, *optional), f"{where}")
+    others = ("others",) if "others" in state else ()  # there is none beside a single model
+    _refuse_other_entries(state, (*_ENTRIES, *_OF_A_MODEL, *others), f"{where}")
     names = [view.name for view in scene.train]
     if state["scene"] != scene.name:
         raise ValueError(f"{where} was trained on the scene {state['scene']!r:.80}, this one is {scene.name!r}.")
     if state["train_views"] != names:
         raise ValueError(f"{where} was trained on the views {state['train_views']!r:.400}, the scene has {names}.")
-    if "fingerprints" in state:
-        _refuse_other_views(state["fingerprints"], scene, where)
+    _refuse_other_views(state["fingerprints"], scene, where)
     config = _config(state["config"], where)
     refuse(config)
     step, times = state["step"], (state["seconds"], state["processor_seconds"])
@@ -187,7 +186,7 @@ def _config(text: Any, where: Path) -> TrainConfig:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{where} is a damaged checkpoint: config is not JSON: {error}") from error
-    return saved_config(values, f"{where}, config")
+    return settings_from(TrainConfig, values, f"{where}, config")
 
 
 def _refuse_other_entries(values: Any, names: Collection[str], what: str) -> None:

@@ -8,9 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from reference_trainer.json_files import settings_from
-
-__all__ = ["TrainConfig", "saved_config"]
+__all__ = ["TrainConfig"]
 
 
 @dataclass(frozen=True)
@@ -131,8 +129,6 @@ class TrainConfig:
             for name in names:
                 if not right(getattr(self, name)):
                     raise ValueError(f"{name} must be {rule}, got {getattr(self, name)!r}{hint}.")
-        if self.renderer in _RENAMED_RENDERERS:
-            raise ValueError(f"the renderer {self.renderer!r} is called {_RENAMED_RENDERERS[self.renderer]!r} now.")
         if self.analytic and not self.regularizers:
             raise ValueError("analytic training needs something to average over: set dropout, noise or regularizer.")
         if self.regularize_from >= self.iterations and self.regularizers:
@@ -167,26 +163,6 @@ class TrainConfig:
         """Highest band of spherical harmonics of the step with this number, the first being 1."""
         return min(self.sh_degree, number // self.sh_every) if self.sh_every else self.sh_degree
 
-
-def saved_config(values: Any, where: str) -> TrainConfig:
-    """Read settings from JSON, as `settings_from` does, also those that a version before 0.2 has written.
-
-    Example:
-        >>> saved_config({"fields": 2, "renderer": "torch"}, "config.json") == TrainConfig(models=2)
-        True
-    """
-    if isinstance(values, dict):
-        values = {_RENAMED_SETTINGS.get(name, name): value for name, value in values.items()}
-        if isinstance(name := values.get("renderer"), str):
-            values["renderer"] = _RENAMED_RENDERERS.get(name, name)
-        if isinstance(on := values.get("random_background"), bool):
-            values["random_background"] = "on" if on else "off"
-    return settings_from(TrainConfig, values, where)
-
-
-# Names of versions before 0.2, which files keep: read from files, refused as arguments.
-_RENAMED_RENDERERS = {"torch": "builtin"}
-_RENAMED_SETTINGS = {"fields": "models"}
 
 _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
     (("iterations", "models"), lambda x: x >= 1, "at least 1", ""),

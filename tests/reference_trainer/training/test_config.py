@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from reference_trainer.json_files import settings_from
 from reference_trainer.training.assembly import check, make_regularizer
-from reference_trainer.training.config import TrainConfig, saved_config
+from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.density import DENSITY, AdaptiveDensity
 from reference_trainer.training.recipes import RECIPES, with_recipe
 
@@ -122,7 +123,7 @@ def test_a_rate_of_numpy_is_written_like_one_of_python():
     assert config.regularizers == "dropout(0.1) + noise(1e-05)"
     check(config)
     read = json.loads(json.dumps(dataclasses.asdict(config)))
-    assert saved_config(read, "config.json") == config
+    assert settings_from(TrainConfig, read, "config.json") == config
 
 
 @pytest.mark.parametrize(
@@ -163,12 +164,3 @@ def test_an_expectation_needs_something_random():
     with pytest.raises(ValueError, match="set dropout, noise"):
         TrainConfig(analytic=True)
     assert TrainConfig(analytic=True, noise=0.1, loss="photometric + co_adaptation(2.0)").analytic
-
-
-def test_settings_of_an_older_version_are_read_and_their_names_refused():
-    old = dataclasses.asdict(TrainConfig(dropout=0.2))
-    old |= {"renderer": "torch", "fields": old.pop("models") + 1, "random_background": True}
-    assert saved_config(old, "config.json") == TrainConfig(dropout=0.2, models=2, random_background="on")
-    assert saved_config(old | {"random_background": False}, "config.json") == TrainConfig(dropout=0.2, models=2)
-    with pytest.raises(ValueError, match=r"renderer 'torch' .*'builtin'"):
-        TrainConfig(renderer="torch")
