@@ -8,7 +8,7 @@ from reference_trainer.training.density.adaptive import AbsGradDensity, Adaptive
 from reference_trainer.training.density.growth import ProximityDensity, RayBoxDensity
 from reference_trainer.training.density.mcmc import MCMCDensity
 from reference_trainer.training.density.pruning import CoPruning, SelfEnsembling, SharePruning
-from reference_trainer.training.density.strategy import DensityStrategy
+from reference_trainer.training.model_state import DensityStrategy
 
 __all__ = [
     "DENSITY", "AbsGradDensity", "AdaptiveDensity", "CoPruning", "DensityStrategy", "MCMCDensity",

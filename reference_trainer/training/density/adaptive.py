@@ -24,8 +24,8 @@ from reference_trainer.training.density.operations import (
     reset_opacity,
     split,
 )
-from reference_trainer.training.density.strategy import DensityStrategy
 from reference_trainer.training.interruption import TrainingStoppedError
+from reference_trainer.training.model_state import DensityStrategy
 from reference_trainer.training.randomness import stream
 
 __all__ = ["AbsGradDensity", "AdaptiveDensity"]

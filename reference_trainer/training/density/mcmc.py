@@ -13,7 +13,7 @@ from reference_trainer.model.gaussians import Gaussians, compute_relocation
 from reference_trainer.model.optimizer import GaussianOptimizer
 from reference_trainer.rotations import rotation_matrices
 from reference_trainer.training.density.operations import refuse_not_finite
-from reference_trainer.training.density.strategy import DensityStrategy
+from reference_trainer.training.model_state import DensityStrategy
 from reference_trainer.training.randomness import stream
 
 __all__ = ["MCMCDensity"]

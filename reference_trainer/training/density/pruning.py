@@ -24,7 +24,6 @@ from reference_trainer.scenes.virtual_cameras import pseudo_cameras
 from reference_trainer.training.config import TrainConfig
 from reference_trainer.training.density.adaptive import AdaptiveDensity
 from reference_trainer.training.density.operations import refuse_not_finite
-from reference_trainer.training.density.strategy import DensityStrategy
 from reference_trainer.training.interruption import TrainingStoppedError
 from reference_trainer.training.model_state import ModelState
 from reference_trainer.training.randomness import stream
@@ -99,7 +98,7 @@ class CoPruning(AdaptiveDensity):
         check_count(every, "every", minimum=1, hint=": density control without it is 'adaptive'")
         self.distance, self.every = distance, every
 
-    def together(self, models: Sequence[ModelState[DensityStrategy]], step: int) -> None:
+    def together(self, models: Sequence[ModelState], step: int) -> None:
         """Prune all models."""
         if not (step > self.config.densify_from and step % self.every == 0):
             return
@@ -117,7 +116,6 @@ class CoPruning(AdaptiveDensity):
                     f"no Gaussian has one of another model within {self.distance:g} after step {step}: raise distance, "
                     "which is in world units."
                 )
-            assert isinstance(model.density, AdaptiveDensity)
             model.density.select(model.optimizer, keep)
 
 
@@ -179,7 +177,7 @@ class SelfEnsembling(CoPruning):
             self.images = torch.zeros(2, self.views, 3, self.cameras[0].height, self.cameras[0].width, device=device)
 
     @torch.no_grad()
-    def together(self, models: Sequence[ModelState[DensityStrategy]], step: int) -> None:
+    def together(self, models: Sequence[ModelState], step: int) -> None:
         """Prune all models, render the first and perturb the others."""
         super().together(models, step)
         if step % self.every or not self.start - 2 * self.every <= step < self.stop:
@@ -218,9 +216,7 @@ class SelfEnsembling(CoPruning):
                 found[splats.indices[inside & near]] = True
         return found
 
-    def perturb(
-        self, model: ModelState[DensityStrategy], chosen: Tensor, step: int, generator: torch.Generator
-    ) -> None:
+    def perturb(self, model: ModelState, chosen: Tensor, step: int, generator: torch.Generator) -> None:
         """Add the noise of a step to the chosen Gaussians, (N,) bool, of a model."""
         x = model.gaussians.params(step=step)
         noisy = self.noise.replay(x, self.noise.draw(x, generator))
