@@ -168,7 +168,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[Any], bool], str, str], ...] = (
     (("iterations", "models"), lambda x: x >= 1, "at least 1", ""),
     (("dropout",), lambda x: 0 <= x < 1, "in [0, 1)", ": 0 turns it off"),
     (("noise",), lambda x: x >= 0, "at least 0", ": 0 turns it off"),
-    (("seed",), lambda x: 0 <= x < 2**64, "in [0, 2^64)", ""),
+    (("seed",), lambda x: 0 <= x < 2**63, "in [0, 2^63)", ""),
     (("guard", "regularize_from", "sh_every", "densify_from", "densify_every", "opacity_reset_from",
       "opacity_reset_every", "prune_size_from", "densify_gradient", "dense_fraction", "prune_opacity", "scales_rate",
       "quaternions_rate", "opacity_rate", "color_rate"), lambda x: x >= 0, "at least 0", ""),

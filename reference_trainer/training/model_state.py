@@ -113,7 +113,7 @@ class DensityStrategy(abc.ABC):
             count: their number.
         """
         # Every model has its own random splits: those of seeds below 2^32 never meet.
-        self.config = replace(config, seed=config.seed + (self.index << 32))
+        self.config = replace(config, seed=(config.seed + (self.index << 32)) % 2**63)
         self.scene, self.extent, self.device = scene, scene.extent, device
         self.large = config.dense_fraction * self.extent  # what is larger is split, what is smaller cloned
         self.reset(count)

@@ -114,6 +114,12 @@ def test_what_is_learned_may_start_at_a_whole_number(tiny_scene):
     assert torch.equal(gaussians.learned["numbers"].detach(), torch.full((150,), 2.0))
 
 
+def test_the_largest_seed_trains_two_models_and_can_be_read_again(tiny_scene, tmp_path):
+    trainer = trained(tiny_scene, TrainConfig(iterations=2, seed=2**63 - 1, models=2), until=1)
+    trainer.save(tmp_path / "checkpoint.pt")
+    assert Trainer.load(tmp_path / "checkpoint.pt", tiny_scene).config == trainer.config
+
+
 SEGS = "self_ensembling(1.0, every=3, start=6, stop=20, views=2)"
 
 
