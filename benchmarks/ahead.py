@@ -86,14 +86,14 @@ def _projection(bands: int) -> list[Kernel]:
     ]
 
 
-def _photometric(label: str, **constants: Any) -> list[Kernel]:
+def _photometric(label: str, expected: bool) -> list[Kernel]:
     block = {"WIDE": 32, "HIGH": 16}
-    expected = {"EXPECTED": constants["EXPECTED"]}
+    constants = block | {"EXPECTED": expected}
     return [
-        Kernel(f"{label}, rows", _ssim_triton.blur_images, expected | block, 8, walks=False),
-        Kernel(f"{label}, columns", _ssim_triton.compare_images, constants | block, 8, walks=False),
+        Kernel(f"{label}, rows", _ssim_triton.blur_images, constants, 8, walks=False),
+        Kernel(f"{label}, columns", _ssim_triton.compare_images, constants, 8, walks=False),
         Kernel(f"{label} backward, rows", _ssim_triton.blur_slopes, block, 8, walks=False),
-        Kernel(f"{label} backward, columns", _ssim_triton.gather_gradients, constants | block, 8, walks=False),
+        Kernel(f"{label} backward, columns", _ssim_triton.gather_gradients, constants, 8, walks=False),
     ]
 
 
@@ -132,9 +132,8 @@ KERNELS = [
     _tiled("moments, gsplat's tiles", moments.moments_forward, 11, 16, 4, MAX=0.999),
     _tiled("shares, gsplat's tiles", moments.moments_backward, 11, 16, 4, MAX=0.999, EACH=False),
     _tiled("shares, gsplat's tiles, in order", moments.moments_backward, 11, 16, 8, MAX=0.999, EACH=True),
-    *_photometric("SSIM", EXPECTED=False, LOSS=False),
-    *_photometric("loss", EXPECTED=False, LOSS=True),
-    *_photometric("expected loss", EXPECTED=True, LOSS=True),
+    *_photometric("loss", expected=False),
+    *_photometric("expected loss", expected=True),
 ]
 
 

@@ -1,4 +1,4 @@
-"""SSIM and the whole photometric loss as kernels: two launches forward, two back.
+"""The photometric loss, SSIM included, as kernels: two launches forward, two back.
 
 A step with few Gaussians waits for the host, which starts kernels one by one, so the formula and all that is added up
 around it happen where the window's second axis is blurred. The first axis has kernels of its own: what they write
@@ -20,7 +20,7 @@ from reference_trainer.render.triton.launching import kernel, launch
 from reference_trainer.render.triton.tiles import store3
 from reference_trainer.training.losses._ssim_constants import C1, C2, WEIGHTS
 
-__all__ = ["photometric_loss", "ssim_map"]
+__all__ = ["photometric_loss"]
 
 _CENTER = tl.constexpr(WEIGHTS[0])
 _RATIO = tl.constexpr(WEIGHTS[1] / WEIGHTS[0])  # a Gaussian's weight at k pixels is _CENTER _RATIO^(k^2)
@@ -96,10 +96,10 @@ def blur_images(
 
 @kernel
 def compare_images(
-    blurred, image, target, variance, slopes, out, width, height, of_error, of_ssim,
-    EXPECTED: tl.constexpr, LOSS: tl.constexpr, WIDE: tl.constexpr, HIGH: tl.constexpr,
+    blurred, image, target, variance, slopes, sums, width, height, of_error, of_ssim,
+    EXPECTED: tl.constexpr, WIDE: tl.constexpr, HIGH: tl.constexpr,
 ):  # fmt: skip
-    """Blur along the columns and evaluate SSIM, (C, H, W), or add up a program's part of the loss.
+    """Blur along the columns, evaluate SSIM, and add up a program's part of the loss.
 
     ``slopes`` (3, C, H, W) are the derivatives of SSIM by the blurred x, x^2 + y^2 and x y.
     """
@@ -117,13 +117,10 @@ def compare_images(
     # The derivatives are derived in `photometric._similarity`.
     to_mean = 2 * weight * (mean_y * (a2 - a1) + ssim * mean_x * (b1 - b2))
     store3(slopes + plane, place, size, inside, to_mean, -weight * ssim * b1, 2 * weight * a1)
-    if LOSS:
-        error, _i, _v, _p, _q = _error(image + plane, target + plane, variance + plane, place, inside, EXPECTED)
-        loss = tl.sum(tl.where(inside, of_error * error + of_ssim * (1 - ssim), 0.0))
-        program = (tl.program_id(2) * tl.num_programs(1) + tl.program_id(1)) * tl.num_programs(0) + tl.program_id(0)
-        tl.store(out + program, loss)
-    else:
-        tl.store(out + plane + place, ssim, mask=inside)
+    error, _i, _v, _p, _q = _error(image + plane, target + plane, variance + plane, place, inside, EXPECTED)
+    loss = tl.sum(tl.where(inside, of_error * error + of_ssim * (1 - ssim), 0.0))
+    program = (tl.program_id(2) * tl.num_programs(1) + tl.program_id(1)) * tl.num_programs(0) + tl.program_id(0)
+    tl.store(sums + program, loss)
 
 
 @kernel
@@ -138,9 +135,8 @@ def blur_slopes(slopes, blurred, width, height, WIDE: tl.constexpr, HIGH: tl.con
 
 @kernel
 def gather_gradients(
-    blurred, image, target, variance, upstream, to_image, to_variance, width,
-    height, of_error, of_ssim, EXPECTED: tl.constexpr, LOSS: tl.constexpr, WIDE: tl.constexpr,
-    HIGH: tl.constexpr,
+    blurred, image, target, variance, upstream, to_image, to_variance, width, height, of_error, of_ssim,
+    EXPECTED: tl.constexpr, WIDE: tl.constexpr, HIGH: tl.constexpr,
 ):  # fmt: skip
     """Blur along the columns, and carry the gradients to the image and its variance."""
     _x, y, place, inside, plane, size = _tile(width, height, WIDE, HIGH)
@@ -151,23 +147,20 @@ def gather_gradients(
     _e, by_image, by_variance, p, q = _error(image + plane, target + plane, variance + plane, place, inside, EXPECTED)
     # x itself, x^2 + y^2 (to which the variance was added) and x y were blurred: their derivatives in x are 1, 2 x and
     # y. SSIM enters the loss as 1 - SSIM, hence the minus below.
-    in_image, in_variance = to_mean + 2 * p * to_squares + q * to_product, to_squares
-    if LOSS:
-        given = tl.load(upstream)
-        of_error, of_ssim = given * of_error, given * of_ssim
-        in_image = of_error * by_image - of_ssim * in_image
-        in_variance = of_error * by_variance - of_ssim * in_variance
-    tl.store(to_image + plane + place, in_image, mask=inside)
+    in_image = to_mean + 2 * p * to_squares + q * to_product
+    given = tl.load(upstream)
+    of_error, of_ssim = given * of_error, given * of_ssim
+    tl.store(to_image + plane + place, of_error * by_image - of_ssim * in_image, mask=inside)
     if EXPECTED:
-        tl.store(to_variance + plane + place, in_variance, mask=inside)
+        tl.store(to_variance + plane + place, of_error * by_variance - of_ssim * to_squares, mask=inside)
 
 
 class _Photometric(torch.autograd.Function):
-    """SSIM of every pixel, or, with weights of a pixel's absolute error and of its 1 - SSIM, the sum of both."""
+    """The sum over pixels of the absolute error and of 1 - SSIM, each with a weight."""
 
     @staticmethod
     def forward(
-        ctx: Any, image: Tensor, target: Tensor, variance: Tensor | None, weights: tuple[float, float] | None
+        ctx: Any, image: Tensor, target: Tensor, variance: Tensor | None, weights: tuple[float, float]
     ) -> Tensor:
         planes, height, width = image.shape
         image, target = image.contiguous(), target.contiguous()
@@ -176,36 +169,28 @@ class _Photometric(torch.autograd.Function):
         ctx.constants = {"WIDE": _WIDE, "HIGH": _HIGH, "warps": _WARPS}
         ctx.expected, ctx.weights = variance is not None, weights
         blurred, slopes = image.new_empty(4, *image.shape), image.new_empty(3, *image.shape)
-        out = torch.empty_like(image) if weights is None else image.new_empty(math.prod(ctx.grid))
+        sums = image.new_empty(math.prod(ctx.grid))
         launch(blur_images, ctx.grid, *images, blurred, width, height, EXPECTED=ctx.expected, **ctx.constants)
         launch(
-            compare_images, ctx.grid, blurred, *images, slopes, out, width, height, *(weights or (0.0, 0.0)),
-            EXPECTED=ctx.expected, LOSS=weights is not None, **ctx.constants,
+            compare_images, ctx.grid, blurred, *images, slopes, sums, width, height, *weights,
+            EXPECTED=ctx.expected, **ctx.constants,
         )  # fmt: skip
         ctx.save_for_backward(*images, slopes)
-        return out if weights is None else out.sum()
+        return sums.sum()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         *images, slopes = ctx.saved_tensors
         _, height, width = images[0].shape
-        if ctx.weights is None:
-            slopes = slopes * gradient
         blurred, to_image = torch.empty_like(slopes), torch.empty_like(images[0])
         to_variance = torch.empty_like(to_image) if ctx.expected else to_image  # written only if there is one
         launch(blur_slopes, ctx.grid, slopes, blurred, width, height, **ctx.constants)
         launch(
-            gather_gradients, ctx.grid, blurred, *images, gradient, to_image, to_variance, width, height,
-            *(ctx.weights or (0.0, 0.0)), EXPECTED=ctx.expected, LOSS=ctx.weights is not None, **ctx.constants,
+            gather_gradients, ctx.grid, blurred, *images, gradient, to_image, to_variance, width, height, *ctx.weights,
+            EXPECTED=ctx.expected, **ctx.constants,
         )  # fmt: skip
         return to_image, None, to_variance if ctx.expected else None, None
-
-
-def ssim_map(image: Tensor, target: Tensor, variance: Tensor | None) -> Tensor:
-    """Return the SSIM of every pixel of float32 pictures (C, H, W), differentiable in image and variance."""
-    similarity: Tensor = _Photometric.apply(image, target, variance, None)  # type: ignore[no-untyped-call]
-    return similarity
 
 
 def photometric_loss(image: Tensor, target: Tensor, variance: Tensor | None, lambda_dssim: float) -> Tensor:

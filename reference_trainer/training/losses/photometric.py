@@ -35,10 +35,7 @@ class Photometric(WeightedTerm):
 
     def value(self, step: Step) -> Tensor:
         """Compare the render of the step with its photograph."""
-        target = step.view.image
-        if step.variance is None:
-            return photometric_loss(step.image, target, self.lambda_dssim)
-        return expected_photometric_loss(step.image, step.variance, target, self.lambda_dssim)
+        return _loss(step.image, step.view.image, step.variance, self.lambda_dssim)
 
 
 def photometric_loss(image: Tensor, target: Tensor, lambda_dssim: float = 0.2) -> Tensor:
@@ -97,10 +94,6 @@ def ssim_map(image: Tensor, target: Tensor, variance: Tensor | None = None) -> T
         True
     """
     _check_pair(image, target, variance)
-    if engine_for(image.device, image.dtype).name == "triton":
-        from reference_trainer.training.losses import _ssim_triton
-
-        return _ssim_triton.ssim_map(image, target, variance)
     similarity: Tensor = _SSIMMap.apply(image, target, variance)  # type: ignore[no-untyped-call]
     return similarity
 
