@@ -82,23 +82,18 @@ def relocate(optimizer: GaussianOptimizer, dead: Tensor, generator: torch.Genera
 
 
 def drawn_copies(optimizer: GaussianOptimizer, weights: Tensor, count: int, generator: torch.Generator) -> Gaussians:
-    """Return copies of Gaussians drawn in proportion to weights (N,), and shrink the originals as well."""
-    drawn = torch.multinomial(weights, count, replacement=True, generator=generator)
-    copies = shared(optimizer.gaussians, drawn)
-    optimizer.relocate(drawn, copies)  # only opacity and scales change
-    optimizer.forget(drawn)
-    return copies
+    """Return copies of Gaussians drawn in proportion to weights (N,).
 
-
-def shared(gaussians: Gaussians, drawn: Tensor) -> Gaussians:
-    """Return copies of the drawn Gaussians, with the opacities and scales that make all at one place look as before.
-
-    Their indices (M,) are repeated if drawn more than once.
+    Copies and originals get the opacities and scales with which all at one place look as the one did.
     """
+    drawn = torch.multinomial(weights, count, replacement=True, generator=generator)
+    copies = optimizer.gaussians[drawn]
+    at_one_place = drawn.bincount(minlength=len(weights))[drawn] + 1
     table = [[math.comb(n, k) for k in range(_MOST)] for n in range(_MOST)]
-    copies = gaussians[drawn]
-    at_one_place = drawn.bincount(minlength=len(gaussians))[drawn] + 1
     binoms = torch.tensor(table, dtype=torch.float64, device=drawn.device)
     opacities, scales = compute_relocation(copies.opacities, copies.scales, at_one_place, binoms)
     logits = torch.logit(opacities.clamp(*_OPACITIES))
-    return replace(copies, opacity_logits=logits, log_scales=scales.log())
+    copies = replace(copies, opacity_logits=logits, log_scales=scales.log())
+    optimizer.relocate(drawn, copies)
+    optimizer.forget(drawn)
+    return copies
