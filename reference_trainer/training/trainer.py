@@ -104,9 +104,10 @@ class Trainer:
             term.begin(scene)
         if config.analytic:
             self._refuse_draws_without_multiplier()
+        self._guards = config.guard > 0 and bool(config.regularizers) and len(scene.train) > 1
         if config.guard and not config.regularizers:
             _log.info("no guard: without dropout or noise the Gaussians of a model need each other.")
-        elif config.guard and len(scene.train) < 2:
+        elif config.guard and not self._guards:
             _log.info("no guard: there is no camera between or beyond a single training view.")
 
     @property
@@ -206,7 +207,7 @@ class Trainer:
         self.loss = value
         self._shown = steps[0].image.detach(), steps[0].view
         self.removed = None
-        if self._guards:
+        if self._guards and self.regularized:
             self._guard()
         steps.clear()  # each step refers to all: a cycle would keep their graphs until garbage collection
         return value
@@ -286,22 +287,17 @@ class Trainer:
                     f"{names} are not: leave out analytic."
                 )
 
-    @property
-    def _guards(self) -> bool:
-        """Whether it is time to remove what hangs where nobody took a photograph."""
-        config, step = self.config, self.step
-        if not (config.guard and config.regularizers and self.regularized and len(self.views) > 1):
-            return False
-        return step == config.iterations or (step > config.densify_from and step % config.guard == 0)
-
     def _guard(self) -> None:
-        """Remove from all models what hangs where nobody took a photograph."""
+        """Remove from all models what hangs where nobody took a photograph, if it is time."""
+        config, step = self.config, self.step
+        if step < config.iterations and (step <= config.densify_from or step % config.guard):
+            return
         for model in self.models:
             gaussians = model.gaussians.map(Tensor.detach)
-            rendered = TrainedModel(gaussians, self.background, self.config.regularizers, self.step, self.sh_degree)
+            rendered = TrainedModel(gaussians, self.background, config.regularizers, step, self.sh_degree)
             found = guard(rendered, self.scene)
             if found.where:
-                _log.info("step %d: %s", self.step, found)
+                _log.info("step %d: %s", step, found)
                 model.density.select(model.optimizer, found.keep)
                 if model is self.models[0]:
                     self.removed = rendered, found
