@@ -102,7 +102,7 @@ class GaussianOptimizer:
         self._replace({name: self._leaf(x.clone()) for name, x in state["gaussians"].items()})
         for name, x in self.gaussians.named():
             self._adam.state[x] = {
-                key: int(value) if self._in_one and key == "step" else value.clone()
+                key: int(value) if self._in_one and key == "step" else value.detach().clone()
                 for key, value in state["moments"][name].items()
             }
 

@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from reference_trainer.tensor_files import load_tensors, moved
 from reference_trainer.training.assembly import make_density, make_regularizer
 from reference_trainer.training.config import TrainConfig
 
-__all__ = ["TrainingState", "fingerprints", "load_checkpoint", "read_state", "save_checkpoint"]
+__all__ = ["fingerprints", "load_checkpoint", "read_state", "save_checkpoint"]
 
 _FORMAT = "ca_reg-checkpoint-1"
 
@@ -72,26 +72,13 @@ _OF_A_MODEL = ("statistics", "regularizer", "gaussians", "moments")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
-class TrainingState(NamedTuple):
-    """A trainer between two steps."""
-
-    config: TrainConfig  # all settings
-    step: int  # number of steps taken
-    seconds: float  # wall-clock time that they took
-    processor_seconds: float  # CPU time that all threads spent on them
-    models: list[dict[str, Any]]  # the `ModelState.state_dict` of each model
-
-
 def read_state(
-    state: dict[str, Any],
-    scene: Scene,
-    where: Path,
-    refuse: Callable[[TrainConfig], None] = lambda config: None,
-) -> TrainingState:
+    state: dict[str, Any], scene: Scene, where: Path, refuse: Callable[[TrainConfig], None]
+) -> tuple[TrainConfig, list[dict[str, Any]]]:
     """Check that what `Trainer.save` wrote is complete and consistent, and belongs to the scene to continue on.
 
     ``where`` is the file, for errors; ``refuse`` is called with the settings before anything that they name is made,
-    and raises to refuse them.
+    and raises to refuse them. Returns the settings, and the `ModelState.state_dict` of each model.
 
     Raises:
         ValueError: if something is missing, unknown, or of another type or shape, a number is not finite or out of
@@ -103,7 +90,9 @@ def read_state(
         raise ValueError(f"{where} is a damaged checkpoint: {error}") from error
 
 
-def _read(state: dict[str, Any], scene: Scene, where: Path, refuse: Callable[[TrainConfig], None]) -> TrainingState:
+def _read(
+    state: dict[str, Any], scene: Scene, where: Path, refuse: Callable[[TrainConfig], None]
+) -> tuple[TrainConfig, list[dict[str, Any]]]:
     """Read a state; wrong types that are not checked for raise TypeError, AttributeError or LookupError."""
     others = ("others",) if "others" in state else ()  # there is none beside a single model
     _refuse_other_entries(state, (*_ENTRIES, *_OF_A_MODEL, *others), f"{where}")
@@ -115,7 +104,7 @@ def _read(state: dict[str, Any], scene: Scene, where: Path, refuse: Callable[[Tr
     _refuse_other_views(state["fingerprints"], scene, where)
     config = _config(state["config"], where)
     refuse(config)
-    step, times = state["step"], (state["seconds"], state["processor_seconds"])
+    step, times = state["step"], tuple(state[name] for name in _TIMES)
     if type(step) is not int or not 0 <= step <= config.iterations:
         raise ValueError(f"{where}: step must be a whole number from 0 to {config.iterations}, got {step!r:.80}.")
     if not all(type(x) is float and 0 <= x < math.inf for x in times):
@@ -123,11 +112,10 @@ def _read(state: dict[str, Any], scene: Scene, where: Path, refuse: Callable[[Tr
     models = [{name: state[name] for name in _OF_A_MODEL}, *state.get("others", ())]
     if len(models) != config.models:
         raise ValueError(f"{where}: expected {config.models} models, got {len(models)}; the checkpoint is damaged.")
-    read = [
+    return config, [
         _read_model(model, config, scene, step, number, f"{where}{f', model {number}' if number else ''}")
         for number, model in enumerate(models)
     ]
-    return TrainingState(config, step, *times, read)
 
 
 def _refuse_other_views(found: Any, scene: Scene, where: Path) -> None:
@@ -175,8 +163,7 @@ def _read_model(
     found = state["regularizer"]
     if type(found) is not dict or not all(isinstance(x, Tensor) and bool(x.isfinite().all()) for x in found.values()):
         raise ValueError(f"{where}, regularizer: expected finite tensors by name; the checkpoint is damaged.")
-    plain = {name: {key: x.detach() for key, x in of.items()} for name, of in moments.items()}
-    return {"statistics": statistics, "regularizer": found, "gaussians": tensors, "moments": plain}
+    return state | {"statistics": statistics}
 
 
 def _config(text: Any, where: Path) -> TrainConfig:

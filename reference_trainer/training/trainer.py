@@ -262,15 +262,16 @@ class Trainer:
             ValueError: if the file is not a readable checkpoint, something in it is missing or does not fit, or it
                 belongs to another scene or other training views, be it of the same names.
         """
-        state = read_state(load_checkpoint(path, device), scene, path, refuse)
+        state = load_checkpoint(path, device)
+        config, models = read_state(state, scene, path, refuse)
         try:
-            trainer = cls(scene, state.config, device)
+            trainer = cls(scene, config, device)
         except ValueError as error:
             raise ValueError(f"{path}, config: {error}") from error
-        trainer.step = state.step
-        trainer.seconds, trainer.processor_seconds = state.seconds, state.processor_seconds
+        trainer.step = state["step"]
+        trainer.seconds, trainer.processor_seconds = state["seconds"], state["processor_seconds"]
         try:
-            for model, of_model in zip(trainer.models, state.models, strict=True):
+            for model, of_model in zip(trainer.models, models, strict=True):
                 model.load_state_dict(of_model)
         except ValueError as error:
             raise ValueError(f"{path}, regularizer: {error}") from error

@@ -25,7 +25,6 @@ class DensityStatistics:
     """Gradients of every Gaussian, and steps that rendered it, since the last densification.
 
     A Gaussian that a step did not render (outside the view, or dropped by a regularizer) is not counted in that step.
-    If dropped Gaussians were counted with their zero gradient, the threshold would in effect rise by 1 / (1 - p).
 
     Args:
         gradient_sum: summed norms of the loss gradient with respect to the projected center in normalized device
