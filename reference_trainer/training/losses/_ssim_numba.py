@@ -58,17 +58,13 @@ def _similarity(first: int, last: int, blurred: Array, c1: float, c2: float, res
     one, two, of_means, of_variances = f4(1), f4(2), f4(c1), f4(c2)
     for i in range(first, last):
         x, y, xy, squared = blurred[0, i], blurred[1, i], blurred[2, i], blurred[3, i]
-        # SSIM = a1 a2 / (b1 b2) with  a1 = 2 x y + c1,             b1 = x^2 + y^2 + c1,
-        #                              a2 = 2 (E[xy] - x y) + c2,   b2 = E[x^2 + y^2] - x^2 - y^2 + c2,
-        # x and y being the blurred images.
+        # The formula and its derivatives are those of `photometric._similarity`, and derived there.
         product, squares = x * y, x * x + y * y
         a1, a2 = two * product + of_means, two * (xy - product) + of_variances
         b1, b2 = squares + of_means, squared - squares + of_variances
         weight = one / (b1 * b2)
         value = a1 * a2 * weight
         result[i] = value
-        # d/dx: a1 grows by 2 y and a2 shrinks by it, b1 grows by 2 x and b2 shrinks by it; then
-        # d/dE[x^2 + y^2] through b2, and d/dE[xy] through a2.
         slopes[0, i] = two * weight * (y * (a2 - a1) + value * x * (b1 - b2))
         slopes[1, i] = -weight * value * b1
         slopes[2, i] = two * weight * a1
