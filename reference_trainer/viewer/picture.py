@@ -101,18 +101,21 @@ class ViewerModel:
         Raises ValueError if heat is needed (for its colors or to hide Gaussians) and cannot be measured, see `heat`; or
         support without photographs.
         """
-        model, view = self.chosen(options), Viewpoint("", camera.to(self.model.gaussians.means.device))
-        renders = {
-            "co-adaptation": self._co_adaptation,
-            "expected error": self._expected_error,
-            "support": self._support,
-            "depth": self._depth,
-        }
-        return renders.get(options.mode, self._render)(options, model, view)
+        view = Viewpoint("", camera.to(self.model.gaussians.means.device))
+        match options.mode:
+            case "expected error":
+                return self._expected_error(view)
+            case "support":
+                return self._support(view)
+            case "co-adaptation":
+                return _co_adaptation(options, self.chosen(options), view)
+            case "depth":
+                return _depth(self.chosen(options), view)
+        return self._render(options, view)
 
-    def _render(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Display:
+    def _render(self, options: DisplayOptions, view: Viewpoint) -> Display:
         """Render the colors of a model, which those of its heat may have replaced."""
-        image, note, scale = model.test_rendering(view).image.clamp(0, 1), "", None
+        image, note, scale = self.chosen(options).test_rendering(view).image.clamp(0, 1), "", None
         if options.mode == "heat":
             low, high = PER_WEIGHT_SCALE
             scale = f"{low:g}", f"{high:g}", "share of the exact CA per blend weight, over the mean"
@@ -122,26 +125,14 @@ class ViewerModel:
             note = f"{hidden:.0%} of the exact CA are hidden"
         return Display(image, note, scale)
 
-    def _co_adaptation(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Display:
-        """Render the exact variance of every pixel."""
-        result = CAScore.exact(model.moments, regularizer=_draws(options))(model.gaussians.opacities, view)
-        rate, noise = options.drop_rate, options.noise
-        of = f" at drop rate {rate:g}" * (rate != 0.5) + f" with noise {noise:g}" * (noise > 0)
-        note = f"exact CA{of} {result.value * 1e3:.2f}e-3" if result.reason is Reason.OK else str(result.reason)
-        scale = "variance of the color"
-        if not bool(result.visible.all()):
-            note += f", {1 - result.visible.double().mean().item():.0%} of the picture not covered"
-            scale += "; gray, not covered: when Gaussians are left out, more than a fifth is background on average"
-        return Display(ca_picture(result), note, ("0", f"{CA_PICTURE_RANGE:g}", scale))
-
-    def _expected_error(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Display:
+    def _expected_error(self, view: Viewpoint) -> Display:
         """Render the expected error of the whole model: hidden and masked Gaussians count."""
         found = self.error_maps(view)
         low, high = found.interval
         scale = "0", f"{ERROR_PICTURE_RANGE:g}", "expected absolute error of the color"
         return Display(expected_error_picture(found), f"expected {found.psnr:.1f} dB, {low:.1f} to {high:.1f}", scale)
 
-    def _support(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Display:
+    def _support(self, view: Viewpoint) -> Display:
         """Render how many training photographs show the surface of the whole model, as `_expected_error` does."""
         if not self.train:
             raise ValueError("the support is told by the training photographs, of which there are none: give --scene.")
@@ -149,18 +140,6 @@ class ViewerModel:
         none, one = ((support == count).double().mean().item() for count in (0, 1))
         scale = "0", f"{most}", "photographs that show it, by the model's depth; gray: nothing covers half of the pixel"
         return Display(heat_map(support, most), f"shown by no photograph {none:.0%}, by one {one:.0%}", scale)
-
-    def _depth(self, options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Display:
-        """Render the nearness of what covers half of a pixel at least."""
-        out = model.test_rendering(view, depth=True)
-        assert out.depth is not None
-        nearness = torch.where(out.alpha > 0.5, out.alpha / out.depth, torch.nan)
-        if not (seen := nearness[nearness.isfinite()]).numel():
-            return Display(torch.full_like(out.image, 0.5), "nothing covers half of a pixel")
-        low, high = seen[:: 1 + len(seen) // 10_000].quantile(seen.new_tensor([0.02, 0.98])).tolist()
-        colors = heat_colors(nearness.flatten(), low, max(high, low * 1.001))
-        scale = f"{1 / low:.3g}", f"{1 / high:.3g}", "depth; gray: nothing covers half of the pixel"
-        return Display(colors.T.view_as(out.image), "", scale)
 
     @torch.no_grad()
     def chosen(self, options: DisplayOptions) -> TrainedModel:
@@ -180,6 +159,32 @@ class ViewerModel:
             gaussians = gaussians[self.heat.ranks < 1 - options.hidden]
         self._chosen_last = options, replace(self.model, gaussians=gaussians, regularizer=regularizer)
         return self._chosen_last[1]
+
+
+def _co_adaptation(options: DisplayOptions, model: TrainedModel, view: Viewpoint) -> Display:
+    """Render the exact variance of every pixel."""
+    result = CAScore.exact(model.moments, regularizer=_draws(options))(model.gaussians.opacities, view)
+    rate, noise = options.drop_rate, options.noise
+    of = f" at drop rate {rate:g}" * (rate != 0.5) + f" with noise {noise:g}" * (noise > 0)
+    note = f"exact CA{of} {result.value * 1e3:.2f}e-3" if result.reason is Reason.OK else str(result.reason)
+    scale = "variance of the color"
+    if not bool(result.visible.all()):
+        note += f", {1 - result.visible.double().mean().item():.0%} of the picture not covered"
+        scale += "; gray, not covered: when Gaussians are left out, more than a fifth is background on average"
+    return Display(ca_picture(result), note, ("0", f"{CA_PICTURE_RANGE:g}", scale))
+
+
+def _depth(model: TrainedModel, view: Viewpoint) -> Display:
+    """Render the nearness of what covers half of a pixel at least."""
+    out = model.test_rendering(view, depth=True)
+    assert out.depth is not None
+    nearness = torch.where(out.alpha > 0.5, out.alpha / out.depth, torch.nan)
+    if not (seen := nearness[nearness.isfinite()]).numel():
+        return Display(torch.full_like(out.image, 0.5), "nothing covers half of a pixel")
+    low, high = seen[:: 1 + len(seen) // 10_000].quantile(seen.new_tensor([0.02, 0.98])).tolist()
+    colors = heat_colors(nearness.flatten(), low, max(high, low * 1.001))
+    scale = f"{1 / low:.3g}", f"{1 / high:.3g}", "depth; gray: nothing covers half of the pixel"
+    return Display(colors.T.view_as(out.image), "", scale)
 
 
 def _draws(options: DisplayOptions) -> Chain:

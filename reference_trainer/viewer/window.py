@@ -200,8 +200,8 @@ class Viewer(contextlib.AbstractContextManager["Viewer", None]):
 
     def _render(self, camera: Camera) -> dict[str, Display]:
         """Return the picture of every model that is chosen, by name; two share the width of the camera."""
-        one = None if self._chosen is None or self._chosen.value == BOTH else self._chosen.value
-        names = list(self._models) if one is None else [one]
+        chosen = BOTH if self._chosen is None else self._chosen.value
+        names = list(self._models) if chosen == BOTH else [chosen]
         width, displays = max(1, camera.width // len(names)), dict[str, Display]()
         camera = replace(camera, width=width, cx=camera.cx - (camera.width - width) / 2)
         with threads_for(len(names) * width * camera.height):

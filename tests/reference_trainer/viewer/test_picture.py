@@ -136,6 +136,15 @@ def test_heat_is_brighter_where_more_co_adapts(model):
     )
 
 
+@pytest.mark.parametrize("mode", ["expected error", "support"])
+def test_what_is_told_of_the_whole_model_needs_no_heat_to_hide_some(model, mode):
+    photograph = View("v", CAMERA, rendered_with(model, 0.5 * model.gaussians.opacities))
+    looks = (DisplayOptions(mode, hidden=hidden) for hidden in (0.0, 0.5))
+    whole, most = (ViewerModel(model, [], train=[photograph]).render(look, CAMERA) for look in looks)
+    assert torch.equal(whole.image, most.image)
+    assert whole.note == most.note
+
+
 def test_heat_that_cannot_be_measured_is_refused(model):
     faint = replace(model, gaussians=replace(model.gaussians, opacity_logits=model.gaussians.opacity_logits - 9))
     for look in (DisplayOptions("heat"), DisplayOptions(hidden=0.1)):
