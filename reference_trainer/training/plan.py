@@ -105,8 +105,11 @@ def make_plan(
     fixed, items = _fixed(config, given), list[PlanItem]()
     for each in RULES:
         rule = partial(each, device=device) if each is unseen else each  # the one that renders
-        items.append(_item(rule(scene, config), config, fixed))
-        config = dataclasses.replace(config, **items[-1].changes)  # what is left out depends on the size
+        item = rule(scene, config)
+        if asked := ", ".join(f"{name}={getattr(config, name)}" for name in item.changes if name in fixed):
+            item = PlanItem(item.name, "used", f"asked for ({asked}); the plan alone: {item.reason}")
+        items.append(item)
+        config = dataclasses.replace(config, **item.changes)  # what is left out depends on the size
     return Plan(tuple(items))
 
 
@@ -115,10 +118,3 @@ def _fixed(config: TrainConfig, given: Collection[str]) -> set[str]:
     # A value at its default may have been asked for: `given` tells, the value cannot.
     default = vars(TrainConfig())
     return {*given, *(name for name, value in vars(config).items() if value != default[name])}
-
-
-def _item(found: PlanItem, config: TrainConfig, fixed: Collection[str]) -> PlanItem:
-    """Turn what a rule has found into a decision: what the user asked for stays."""
-    chosen = ", ".join(f"{name}={getattr(config, name)}" for name in found.changes if name in fixed)
-    reason = f"asked for ({chosen}); the plan alone: {found.reason}"
-    return PlanItem(found.name, "used", reason) if chosen else found
