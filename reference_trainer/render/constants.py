@@ -5,6 +5,7 @@ They are the INRIA rasterizer's unless said otherwise.
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 NEAR_PLANE: Final = 0.2
@@ -33,6 +34,12 @@ ellipse."""
 MIN_TRANSMITTANCE: Final = 1e-4
 """A splat that would leave less transmittance than this terminates its pixel and is itself not
 rendered."""
+
+HARMONICS: Final = tuple(
+    math.sqrt(numerator / (denominator * math.pi))
+    for numerator, denominator in ((1, 4), (3, 4), (15, 4), (5, 16), (35, 32), (105, 4), (21, 32), (7, 16))
+)
+"""What normalizes the real spherical harmonics: a number each for bands 0 and 1, two for band 2, four for band 3."""
 
 TILE: Final = 8
 """Side of a tile in pixels. Own choice: at the INRIA value of 16, about 1.6 times as many pairs are

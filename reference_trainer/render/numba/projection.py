@@ -19,7 +19,7 @@ from reference_trainer.camera import Camera
 from reference_trainer.compiled.compiling import inlined, kernel
 from reference_trainer.compiled.threads import in_threads
 from reference_trainer.render.checks import numbers_to_check
-from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN
+from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, HARMONICS
 from reference_trainer.render.splats import Projected, Projection
 from reference_trainer.render.torch.projection import visible
 
@@ -27,11 +27,7 @@ __all__ = ["basis", "basis_gradient", "project"]
 
 Array = Any
 f4 = np.float32
-_A = f4(math.sqrt(1 / (4 * math.pi)))
-_B = f4(math.sqrt(3 / (4 * math.pi)))
-_C, _D = f4(math.sqrt(15 / (4 * math.pi))), f4(math.sqrt(5 / (16 * math.pi)))
-_E, _F = f4(math.sqrt(35 / (32 * math.pi))), f4(math.sqrt(105 / (4 * math.pi)))
-_G, _H = f4(math.sqrt(21 / (32 * math.pi))), f4(math.sqrt(7 / (16 * math.pi)))
+_A, _B, _C, _D, _E, _F, _G, _H = (f4(x) for x in HARMONICS)
 _ZERO, _HALF, _ONE, _TWO, _THREE = f4(0), f4(0.5), f4(1), f4(2), f4(3)
 _FOUR, _SIX, _EIGHT, _DILATION = f4(4), f4(6), f4(8), f4(DILATION)
 _NO_DIRECTION = f4(1e-30)  # a quaternion well below this is taken for 0

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALPHA, NEAR_PLANE
+from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, HARMONICS, MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.splats import Projection
 from reference_trainer.rotations import rotations
 
 __all__ = ["evaluate_sh", "project", "sh_basis", "visible"]
+
+_A, _B, _C, _D, _E, _F, _G, _H = HARMONICS
 
 
 @torch.no_grad()
@@ -65,18 +65,6 @@ def project(
     )
 
 
-_C0 = math.sqrt(1 / (4 * math.pi))
-_C1 = math.sqrt(3 / (4 * math.pi))
-_C2 = (math.sqrt(15 / (4 * math.pi)), math.sqrt(5 / (16 * math.pi)), math.sqrt(15 / (16 * math.pi)))
-_C3 = (
-    math.sqrt(35 / (32 * math.pi)),
-    math.sqrt(105 / (4 * math.pi)),
-    math.sqrt(21 / (32 * math.pi)),
-    math.sqrt(7 / (16 * math.pi)),
-    math.sqrt(105 / (16 * math.pi)),
-)
-
-
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Evaluate the (degree + 1)^2 real spherical harmonics, up to 3, of unit vectors (N, 3).
 
@@ -88,21 +76,21 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
         torch.Size([1, 4])
     """
     x, y, z = directions.unbind(-1)
-    basis = [torch.full_like(x, _C0)]
+    basis = [torch.full_like(x, _A)]
     if degree >= 1:
-        basis += [-_C1 * y, _C1 * z, -_C1 * x]
+        basis += [-_B * y, _B * z, -_B * x]
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        basis += [_C2[0] * x * y, -_C2[0] * y * z, _C2[1] * (2 * zz - xx - yy), -_C2[0] * x * z, _C2[2] * (xx - yy)]
+        basis += [_C * x * y, -_C * y * z, _D * (2 * zz - xx - yy), -_C * x * z, 0.5 * _C * (xx - yy)]
     if degree >= 3:
         basis += [
-            -_C3[0] * y * (3 * xx - yy),
-            _C3[1] * x * y * z,
-            -_C3[2] * y * (4 * zz - xx - yy),
-            _C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
-            -_C3[2] * x * (4 * zz - xx - yy),
-            _C3[4] * z * (xx - yy),
-            -_C3[0] * x * (xx - 3 * yy),
+            -_E * y * (3 * xx - yy),
+            _F * x * y * z,
+            -_G * y * (4 * zz - xx - yy),
+            _H * z * (2 * zz - 3 * xx - 3 * yy),
+            -_G * x * (4 * zz - xx - yy),
+            0.5 * _F * z * (xx - yy),
+            -_E * x * (xx - 3 * yy),
         ]
     return torch.stack(basis, dim=-1)
 
@@ -121,7 +109,7 @@ def evaluate_sh(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor
         [[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]
     """
     if degree == 0:
-        return torch.relu(_C0 * coefficients[:, 0] + 0.5)
+        return torch.relu(_A * coefficients[:, 0] + 0.5)
     count = coefficients.shape[1]
     # Repeating the basis per channel and summing over it as matrix products keeps all axes long: on
     # a CPU this is several times faster than a batched product or a broadcast over the three

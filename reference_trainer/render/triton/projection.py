@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, MIN_ALPHA, NEAR_PLANE
+from reference_trainer.render.constants import DILATION, FRUSTUM_MARGIN, HARMONICS, MIN_ALPHA, NEAR_PLANE
 from reference_trainer.render.splats import Projected, Projection
 from reference_trainer.render.triton.binning import count_tiles
 from reference_trainer.render.triton.launching import kernel, launch
@@ -22,13 +21,8 @@ __all__ = ["project"]
 
 _DILATION = tl.constexpr(DILATION)
 _MIN_ALPHA, _NEAR_PLANE = tl.constexpr(MIN_ALPHA), tl.constexpr(NEAR_PLANE)
+_A, _B, _C, _D, _E, _F, _G, _H = (tl.constexpr(x) for x in HARMONICS)
 _BLOCK = 128  # Gaussians of a program, one per lane: neighbors in memory, whose rows share cache lines
-
-# Normalization of the real spherical harmonics of degrees 0 to 3, as in `evaluate_sh`.
-_A, _B = tl.constexpr(math.sqrt(1 / (4 * math.pi))), tl.constexpr(math.sqrt(3 / (4 * math.pi)))
-_C, _D = tl.constexpr(math.sqrt(15 / (4 * math.pi))), tl.constexpr(math.sqrt(5 / (16 * math.pi)))
-_E, _F = tl.constexpr(math.sqrt(35 / (32 * math.pi))), tl.constexpr(math.sqrt(105 / (4 * math.pi)))
-_G, _H = tl.constexpr(math.sqrt(21 / (32 * math.pi))), tl.constexpr(math.sqrt(7 / (16 * math.pi)))
 
 
 @triton.jit
