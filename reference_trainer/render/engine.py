@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from reference_trainer.camera import Camera
-from reference_trainer.render.splats import Engine, Projected, Splats
+from reference_trainer.render.splats import Engine, MomentImages, Projected, Splats
 from reference_trainer.render.torch.engine import TorchEngine
 
 __all__ = [
@@ -140,9 +140,9 @@ class _CompiledEngine:
             for module in ("projection", "binning", "compositing", "moments")
         )
         self._project, self.bin = projection.project, binning.bin_gaussians
-        self.composite, self.composite_masks = compositing.composite, compositing.composite_masks
-        self.absolute_gradients = compositing.absolute_gradients
-        self.moments, self.shares = moments.moments, moments.shares
+        self._composite, self._moments = compositing.composite, moments.moments
+        self.composite_masks, self.absolute_gradients = compositing.composite_masks, compositing.absolute_gradients
+        self.shares = moments.shares
 
     def project(
         self, inputs: dict[str, Tensor], camera: Camera, degree: int | None, background: Tensor | None = None
@@ -159,6 +159,20 @@ class _CompiledEngine:
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
         """Keep the lists: what is too faint is skipped."""
         return splats._replace(opacities=opacities)
+
+    def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Composite splats front to back."""
+        p = splats.projection
+        image, alpha = self._composite(
+            splats, background, depth, p.means, p.factors, splats.opacities, splats.colors, p.depths
+        )
+        return (image[:3], alpha, image[3]) if depth else (image, alpha, None)
+
+    def moments(self, splats: Splats, multiplier: Tensor, background: Tensor) -> MomentImages:
+        """Composite mean and variance back to front."""
+        p = splats.projection
+        images = self._moments(splats, multiplier, background, p.means, p.factors, splats.opacities, splats.colors)
+        return MomentImages(*images)
 
 
 @functools.cache

@@ -245,7 +245,7 @@ def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tu
 
 
 class _Composite(torch.autograd.Function):
-    """Transmittance of all splats (1, H, W), and the image over the background, whose fourth channel is depth."""
+    """The image over the background, with depth as a fourth channel if asked for, and the accumulated alpha."""
 
     @staticmethod
     def forward(
@@ -256,13 +256,13 @@ class _Composite(torch.autograd.Function):
         kernel = _forward_with_depth if depth else _forward
         tiles.over_tiles(kernel, ctx.lists, table, background, transmittance, image)
         ctx.save_for_backward(table, transmittance, image)
-        return ctx.lists.cut(transmittance), ctx.lists.cut(image)
+        return ctx.lists.cut(image), 1 - ctx.lists.cut(transmittance)[0]
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, to_transmittance: Tensor, to_image: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, to_image: Tensor, to_alpha: Tensor) -> tuple[Tensor | None, ...]:
         table, transmittance, image = ctx.saved_tensors
-        upstream = ctx.lists.padded(to_transmittance), ctx.lists.padded(to_image)
+        upstream = ctx.lists.padded(-to_alpha[None]), ctx.lists.padded(to_image)
         rows, depth = table.new_empty(ctx.lists.gaussians.shape[0], table.shape[1]), len(image) == 4
         kernel = _backward_with_depth if depth else _backward
         tiles.over_tiles(kernel, ctx.lists, ctx.lists.slots, table, transmittance, image, *upstream, rows)
@@ -271,14 +271,7 @@ class _Composite(torch.autograd.Function):
         return None, to_background, None, *sums, to_depths[:, 0] if depth else None
 
 
-def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Composite front to back, see `Engine.composite`."""
-    p = splats.projection
-    transmittance, image = _Composite.apply(  # type: ignore[no-untyped-call]
-        splats, background, depth, p.means, p.factors, splats.opacities, splats.colors, p.depths
-    )
-    alpha = 1 - transmittance[0]
-    return (image[:3], alpha, image[3]) if depth else (image, alpha, None)
+composite = _Composite.apply
 
 
 def absolute_gradients(splats: Splats, rendered: Tensor, gradient: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from torch.autograd.function import once_differentiable
 from reference_trainer.compiled.compiling import inlined, kernel
 from reference_trainer.render.numba import tiles
 from reference_trainer.render.numba.tiles import CHUNK, PIXELS
-from reference_trainer.render.splats import MomentImages, Splats, TileLists
+from reference_trainer.render.splats import Splats, TileLists
 
 __all__ = ["moments", "shares"]
 
@@ -210,57 +210,51 @@ _backward, _complete_backward = _make_backward(False), _make_backward(True)
 def _gradients(
     lists: TileLists, table: Tensor, background: Tensor, upstream: Sequence[Tensor], complete: bool
 ) -> list[Tensor]:
-    """Return the gradients of splats, (multipliers, shares) and background.
-
-    The second has shape (M, 3) if ``complete``, else (M, 0).
-    """
+    """Return the gradients of splats, (multipliers, shares) and background; the second (M, 3) if ``complete``."""
     rows = table.new_empty(lists.gaussians.shape[0], 12 if complete else 9)
-    to_background = tiles.whole_tiles(lists, 3)  # contiguous, which a background need not be
+    to_background = tiles.whole_tiles(lists, 3)
     assert lists.slots is not None
-    kernel = _complete_backward if complete else _backward
-    tiles.over_tiles(kernel, lists, lists.slots, table, background, *upstream, rows, to_background)
-    return [*tiles.sum_rows(rows, table, lists), to_background]
+    kernel, images = _complete_backward if complete else _backward, map(lists.padded, (background, *upstream))
+    tiles.over_tiles(kernel, lists, lists.slots, table, *images, rows, to_background)
+    # Contiguous, as the sum over a part of each row, which the gradient of a single color is, would round differently.
+    return [*tiles.sum_rows(rows, table, lists), lists.cut(to_background).contiguous()]
 
 
 class _Moments(torch.autograd.Function):
-    """Mean and variance of the colors, and expected alpha: 3, 3 and 1 channels, whole tiles."""
+    """Mean and variance of the colors, and the expected accumulated alpha."""
 
     @staticmethod
     def forward(ctx: Any, splats: Splats, multiplier: Tensor, background: Tensor, *_differentiable: Tensor) -> Any:
         # Without a gradient of the alphas, the faster kernel is enough: None must not become zeros.
         ctx.set_materialize_grads(False)
         table, ctx.lists = tiles.make_table(splats, multiplier), splats.lists
-        images = tuple(tiles.whole_tiles(ctx.lists, channels) for channels in (3, 3, 1))
-        tiles.over_tiles(_forward, ctx.lists, table, background, *images)
+        images = [tiles.whole_tiles(ctx.lists, channels) for channels in (3, 3, 1)]
+        tiles.over_tiles(_forward, ctx.lists, table, ctx.lists.padded(background), *images)
         ctx.save_for_backward(table, background)
-        return images
+        mean, variance, alpha = map(ctx.lists.cut, images)
+        return mean, variance, alpha[0]
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(
+        ctx: Any, to_mean: Tensor | None, to_variance: Tensor | None, to_alpha: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
         table, background = ctx.saved_tensors
-        complete = gradients[2] is not None or ctx.needs_input_grad[1]
+        complete = to_alpha is not None or ctx.needs_input_grad[1]
+        gradients = to_mean, to_variance, None if to_alpha is None else to_alpha[None]
         upstream = [torch.zeros_like(background) if x is None else x for x in gradients]
         *of_splats, more, to_background = _gradients(ctx.lists, table, background, upstream, complete)
         return None, more[:, :2] if complete else None, to_background, *of_splats
 
 
-def moments(splats: Splats, multiplier: Tensor, background: Tensor) -> MomentImages:
-    """Composite mean and variance back to front, see `Engine.moments`."""
-    p, lists = splats.projection, splats.lists
-    images = _Moments.apply(  # type: ignore[no-untyped-call]
-        splats, multiplier, lists.padded(background), p.means, p.factors, splats.opacities, splats.colors
-    )
-    mean, variance, alpha = (lists.cut(image) for image in images)
-    return MomentImages(mean, variance, alpha[0])
+moments = _Moments.apply
 
 
 def shares(splats: Splats, multiplier: Tensor, background: Tensor, weights: Tensor) -> Tensor:
     """Return every splat's share of the weighted variance of the pixels, see `Engine.shares`."""
-    lists, table = splats.lists, tiles.make_table(splats, multiplier)
-    upstream = lists.padded((weights / 3).expand(3, -1, -1))
+    table, upstream = tiles.make_table(splats, multiplier), (weights / 3).expand(3, -1, -1)
     # A share is a summand of V times its gradient, here the weight of the pixel: the backward pass
     # of a loss that is the weighted variance, of which only the shares are read.
     nothing = torch.zeros_like(upstream)
-    *_, more, _ = _gradients(lists, table, lists.padded(background), (nothing, upstream, nothing), complete=True)
+    *_, more, _ = _gradients(splats.lists, table, background, (nothing, upstream, nothing), complete=True)
     return more[:, 2].double()

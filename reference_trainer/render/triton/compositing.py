@@ -193,6 +193,9 @@ class _Composite(torch.autograd.Function):
         return None, to_background, None, g[:, :2], g[:, 2:5], g[:, 5], g[:, 6:9], depth
 
 
+composite = _Composite.apply
+
+
 def _gradients(lists: Lists, table: Tensor, *images: Tensor, absolute: bool) -> Tensor:
     """Return rows of gradients, (M, 16), given the image, alpha, and the gradients of both."""
     rows, each = tiles.gradient_rows(lists, table)
@@ -200,15 +203,6 @@ def _gradients(lists: Lists, table: Tensor, *images: Tensor, absolute: bool) -> 
     constants = {"DEPTH": len(images[0]) == 4, "ABSOLUTE": absolute, "EACH": each}
     tiles.over_tiles(composite_backward, lists, table, *arguments, rows, **constants)
     return tiles.sum_rows(rows, each, lists, len(table))
-
-
-def composite(splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Composite splats front to back, see `Engine.composite`."""
-    p = splats.projection
-    image, alpha = _Composite.apply(  # type: ignore[no-untyped-call]
-        splats, background, depth, p.means, p.factors, splats.opacities, splats.colors, p.depths
-    )
-    return (image[:3], alpha, image[3]) if depth else (image, alpha, None)
 
 
 def composite_masks(splats: Splats, opacities: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:

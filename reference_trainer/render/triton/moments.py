@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from reference_trainer.render.constants import TILE
-from reference_trainer.render.splats import MomentImages, Splats
+from reference_trainer.render.splats import Splats
 from reference_trainer.render.triton import tiles
 from reference_trainer.render.triton.launching import kernel
 from reference_trainer.render.triton.tiles import Lists, add_row, alpha_at, geometry_sums, make_row, pixels
@@ -224,13 +224,7 @@ class _Moments(torch.autograd.Function):
         return None, g[:, 9:11], to_background, g[:, :2], g[:, 2:5], g[:, 5], g[:, 6:9]
 
 
-def moments(splats: Splats, multiplier: Tensor, background: Tensor) -> MomentImages:
-    """Composite mean and variance back to front, see `Engine.moments`."""
-    p = splats.projection
-    images = _Moments.apply(  # type: ignore[no-untyped-call]
-        splats, multiplier, background, p.means, p.factors, splats.opacities, splats.colors
-    )
-    return MomentImages(*images)
+moments = _Moments.apply
 
 
 def shares_of(table: Tensor, lists: Lists, background: Tensor, weights: Tensor) -> Tensor:
