@@ -103,6 +103,8 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
         raise ValueError(f"{path}: the format must be {', '.join(_BYTE_ORDERS)} or ascii (1.0), got '{layout}'.")
     if elements[:1] != ["vertex"] or "vertex" in elements[1:] or count < 0:
         raise ValueError(f"{path}: the first element must be 'vertex' with a count, got {elements[:8] or 'none'}.")
+    if not properties:
+        raise ValueError(f"{path}: the vertices must have properties such as 'property float x', got none.")
     return _Header(layout, count, properties, comments, alone=len(elements) == 1)
 
 

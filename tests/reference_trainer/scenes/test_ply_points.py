@@ -58,6 +58,7 @@ def test_ascii(tmp_path):
         b"ply\nformat ascii 1.0\nend_header\n",
         b"ply\nformat ascii 1.0\nelement face 1\nend_header\n",
         b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+        b"ply\nformat ascii 1.0\nelement vertex 1\nend_header\n\n",
         header("binary_little_endian") + b"short",
         header("binary_little_endian", count=2**60) + b"short",
         header("binary_little_endian", count=-1) + b"short",
