@@ -204,5 +204,5 @@ def _runs_triton(device: torch.device, chosen: str) -> bool:
         return chosen == "triton" and os.environ.get("TRITON_INTERPRET") == "1"
     if device.type != "cuda" or chosen == "numba":
         return False
-    known = torch.cuda.is_available() and torch.version.hip is None
-    return not known or torch.cuda.get_device_capability(device) >= (7, 5)
+    absent = not torch.cuda.is_available() or (device.index is not None and device.index >= torch.cuda.device_count())
+    return absent or torch.version.hip is not None or torch.cuda.get_device_capability(device) >= (7, 5)

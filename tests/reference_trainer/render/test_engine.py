@@ -66,6 +66,18 @@ def test_the_line_of_a_triton_that_came_by_another_name(unnamed):
     assert describe_engine("cuda") == f"triton ({triton.__version__})"
 
 
+def test_the_line_of_a_card_that_another_machine_has(monkeypatch):
+    """As before a sweep on a cluster, from a machine with one card."""
+
+    def capability(device):
+        raise AssertionError("Invalid device id")  # PyTorch's own words
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", capability)
+    assert describe_engine("cuda:1").split()[0] == ("triton" if find_spec("triton") else "torch")
+
+
 @pytest.mark.parametrize("version", ["3.1.0", "3.3.1", "3.3.1+git5c1e5bb"])
 def test_a_triton_that_compiles_no_tuples_is_as_good_as_none(version, afresh, monkeypatch):
     """As that of torch 2.5 to 2.7: said once, and refused by name."""
