@@ -25,7 +25,6 @@ __all__ = [
 ]  # fmt: skip
 
 ENGINES = ("auto", "torch", "numba", "triton")
-_RENAMED = {"loops": "numba"}
 _VARIABLE = "CA_REG_ENGINE"
 _TORCH = TorchEngine()
 
@@ -47,7 +46,8 @@ def use_engine(name: str) -> None:
         'torch'
         >>> use_engine("auto")
     """
-    _check_name(name, "there is no engine {name!r}")
+    if name not in ENGINES:
+        raise ValueError(f"there is no engine {name!r}; choose one of {', '.join(ENGINES)}.")
     if name == "numba" and _compiled_engine("numba") is None:
         raise ImportError("the engine numba needs numba: pip install 'ca_reg[trainer]', or use the engine torch.")
     if name == "triton" and _compiled_engine("triton") is None:
@@ -65,15 +65,9 @@ def chosen_engine() -> str:
         ValueError: if the environment names an engine that does not exist.
     """
     chosen = os.environ.get(_VARIABLE, "auto")
-    _check_name(chosen, f"{_VARIABLE} names the engine {{name!r}}")
+    if chosen not in ENGINES:
+        raise ValueError(f"{_VARIABLE} names the engine {chosen!r}; choose one of {', '.join(ENGINES)}.")
     return chosen
-
-
-def _check_name(name: str, complaint: str) -> None:
-    """Raise a ValueError that begins with the complaint unless there is such an engine."""
-    if name not in ENGINES:
-        hint = f"it is called {_RENAMED[name]} now" if name in _RENAMED else f"choose one of {', '.join(ENGINES)}"
-        raise ValueError(f"{complaint.format(name=name)}; {hint}.")
 
 
 def engine_for(device: torch.device, dtype: torch.dtype = torch.float32) -> Engine:

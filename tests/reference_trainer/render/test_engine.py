@@ -114,14 +114,6 @@ def test_an_engine_that_does_not_exist(monkeypatch):
         describe_engine("cpu")
 
 
-def test_the_old_name_of_an_engine_is_refused_with_the_new_one(monkeypatch):
-    with pytest.raises(ValueError, match=r"no engine 'loops'; .*numba"):
-        use_engine("loops")
-    monkeypatch.setenv("CA_REG_ENGINE", "loops")
-    with pytest.raises(ValueError, match=r"CA_REG_ENGINE .*'loops'; .*numba"):
-        describe_engine("cpu")
-
-
 @pytest.mark.parametrize("chosen", [None, "auto", "torch"])
 @pytest.mark.parametrize("engine", ["numba", "torch"])
 def test_what_was_chosen_is_chosen_again(chosen, engine, monkeypatch):
