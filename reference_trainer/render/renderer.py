@@ -222,8 +222,6 @@ def variance_shares(
 def _background_image(background: Tensor | None, splats: Splats) -> Tensor:
     """Return the background of every pixel, (3, H, W)."""
     shape = (3, splats.lists.height, splats.lists.width)
-    if background is None:
-        return splats.colors.new_zeros(shape)
     found = checked_background(background, splats, (3,), shape)
     return (found if found.ndim == 3 else found[:, None, None]).expand(shape)
 

@@ -316,11 +316,11 @@ class _Project(torch.autograd.Function):
         degree: int,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         count = indices.shape[0]
-        limits = (0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
-        intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy, *(FRUSTUM_MARGIN * limit for limit in limits)]
+        fx, fy = camera.fx, camera.fy
+        limits = FRUSTUM_MARGIN * (0.5 * camera.width / fx), FRUSTUM_MARGIN * (0.5 * camera.height / fy)
         inputs = [x.detach().contiguous() for x in (indices, means, quaternions, scales, sh)]
-        view = (x.contiguous().numpy() for x in (camera.world_to_camera, camera.position))
-        ctx.view = degree, next(view), np.array(intrinsics, f4), next(view)
+        view, position = (x.contiguous().numpy() for x in (camera.world_to_camera, camera.position))
+        ctx.view = degree, view, np.array([fx, fy, camera.cx, camera.cy, *limits], f4), position
         outputs = tuple(means.new_empty(count, *shape) for shape in ((2,), (3,), (3,), (), (3,)))
         in_threads(_forward, count, *(x.numpy() for x in inputs), *ctx.view, *(x.numpy() for x in outputs), least=4096)
         ctx.save_for_backward(*inputs, outputs[-1])

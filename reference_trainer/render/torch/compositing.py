@@ -101,8 +101,7 @@ def blocks(lists: TileLists, device: torch.device) -> Iterator[Block]:
     pairs = block_pairs(device)
     lengths, tiles = torch.sort(lists.lengths, descending=True, stable=True)
     sizes = lengths.cpu().tolist()
-    end = next((i for i, n in enumerate(sizes) if n == 0), len(sizes))
-    first = 0
+    first, end = 0, sum(n > 0 for n in sizes)
     while first < end:
         last = min(end, first + max(1, pairs // (PIXELS * sizes[first])))
         indices = tiles[first:last]

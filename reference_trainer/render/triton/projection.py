@@ -404,19 +404,18 @@ def project(
     indices = torch.empty_like(visible, dtype=torch.int64)
     launch(index_visible, grid, torch.cumsum(visible, 0, dtype=torch.int32), indices, numbers, count, **block)
     outputs = [means.new_empty(count, *shape) for shape in ((2,), (3,), (3,), (), (3,), ())]
-    limits = (FRUSTUM_MARGIN * 0.5 * size / f for size, f in ((camera.width, camera.fx), (camera.height, camera.fy)))
-    of_x, of_y = limits
+    limits = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx, FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
     constants = {"warps": 4, "BANDS": bands, "ROW": sh.shape[1], "BLOCK": _BLOCK}
     launch(
         project_forward, (triton.cdiv(count, _BLOCK),), indices, *given, plain, view, *outputs, numbers,
-        camera.fx, camera.fy, camera.cx, camera.cy, of_x, of_y, **constants,
+        camera.fx, camera.fy, camera.cx, camera.cy, *limits, **constants,
     )  # fmt: skip
     counts = count_tiles([*outputs[:3], outputs[5]], numbers, camera.width, camera.height)
     read = numbers.cpu()  # the one wait for the card
     seen = int(read[SEEN.value])
     indices, *outputs = (x[:seen] for x in (indices, *outputs))
     *found, colors, shown = _Project.apply(  # type: ignore[no-untyped-call]
-        *differentiable, outputs, [indices, *given, view], (camera.fx, camera.fy, of_x, of_y), constants
+        *differentiable, outputs, [indices, *given, view], (camera.fx, camera.fy, *limits), constants
     )
     counts = counts._replace(each=counts.each[:seen], touched=counts.touched[:seen], total=int(read[ENTRIES.value]))
     return Projected(indices, Projection(*found), shown, colors, read[: SEEN.value], counts)
