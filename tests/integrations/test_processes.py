@@ -11,6 +11,7 @@ from urllib.error import URLError
 import numpy as np
 import pytest
 import torch
+from launched import FILES
 from oracles import random_scene
 from stand_ins.gsplat import intrinsics, rasterization
 
@@ -20,31 +21,53 @@ from ca_reg.integrations.run import main
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path), "OMP_NUM_THREADS": "1"}
 
 
+@pytest.fixture
+def launched(monkeypatch, capfd):
+    """The launcher in this process, in a folder of its own, and what it and the processes of its script say.
+
+    That it is a program with an exit code is tested in `test_run.py`.
+    """
+
+    def launched(*arguments, cwd, path=()):
+        monkeypatch.chdir(cwd)
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join([*map(str, path), ENVIRONMENT["PYTHONPATH"]]))
+        code = 0
+        try:
+            main([str(x) for x in arguments])
+        except SystemExit as ended:
+            code = ended.code
+        return code, capfd.readouterr().err
+
+    return launched
+
+
 def run(*arguments, cwd):
     command = [sys.executable, "-m", "ca_reg.integrations.run", *map(str, arguments)]
     return subprocess.run(command, cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.slow
-def test_scripts_that_a_script_starts_are_hooked(repository, tmp_path):
+def test_scripts_that_a_script_starts_are_hooked_and_find_old_names_of_libraries(repository, launched, tmp_path):
     text = (repository / "train.py").read_text()
     (repository / "render.py").write_text(text.replace("range(1, iterations + 1)", "[]"))
+    (repository / "train.py").write_text(OLD + text)
     start = """
         import os, subprocess, sys
         os.system(f"{sys.executable} render.py 0")
         subprocess.run([sys.executable, "train.py", "2"], check=True)
     """
     (repository / "both.py").write_text(textwrap.dedent(start))
-    done = run("--dropout", 0.5, "--report", tmp_path / "report.json", "both.py", cwd=repository)
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"render\.py, .*: 0 renders regularized; 1 renders scaled", done.stderr)
-    report = json.loads((tmp_path / "report.json").read_text())
-    found = {child["script"]: child["renders"]["regularized"] for child in report["started"]}
+    report = tmp_path / "report.json"
+    code, said = launched("--dropout", 0.5, "--report", report, "both.py", cwd=repository)
+    assert code == 0, said
+    assert re.search(r"render\.py, .*: 0 renders regularized; 1 renders scaled", said)
+    found = {child["script"]: child["renders"]["regularized"] for child in json.loads(report.read_text())["started"]}
     assert found == {"render.py": 0, "train.py": 2}
+    assert not {"int", "float"} & set(vars(np))
 
 
 @pytest.mark.slow
-def test_a_command_that_a_script_starts_is_read_itself(repository, tmp_path, monkeypatch):
+def test_a_command_that_a_script_starts_is_read_itself(repository, launched, tmp_path):
     """Such as ns-train: the script that starts it does not tell what it renders with."""
     (tmp_path / "site").mkdir()
     (repository / "diff_gaussian_rasterization.py").rename(tmp_path / "site" / "their_rasterizer.py")
@@ -52,9 +75,8 @@ def test_a_command_that_a_script_starts_is_read_itself(repository, tmp_path, mon
     renderer.write_text(renderer.read_text().replace("diff_gaussian_rasterization", "their_rasterizer"))
     (repository / "train.py").rename(repository / "their-train")
     (repository / "all.py").write_text('import subprocess, sys\nsubprocess.run([sys.executable, "their-train", "2"])\n')
-    monkeypatch.setitem(ENVIRONMENT, "PYTHONPATH", f"{tmp_path / 'site'}{os.pathsep}{ENVIRONMENT['PYTHONPATH']}")
-    done = run("--dropout", 0.5, "all.py", cwd=repository)
-    assert re.search(r"their-train, .*: 2 renders regularized", done.stderr)
+    _, said = launched("--dropout", 0.5, "all.py", cwd=repository, path=[tmp_path / "site"])
+    assert re.search(r"their-train, .*: 2 renders regularized", said)
 
 
 @pytest.mark.slow
@@ -80,14 +102,14 @@ def test_what_forks_of_a_script_did_is_reported(repository, tmp_path):
 
 
 @pytest.mark.slow
-def test_relative_paths_of_the_options_hold_in_a_process_that_starts_elsewhere(repository, tmp_path):
+def test_relative_paths_of_the_options_hold_in_a_process_that_starts_elsewhere(repository, launched, tmp_path):
     (tmp_path / "my_module.py").write_text("from ca_reg import GaussianDropout as Own\n")
     (tmp_path / "garden").mkdir()
     start = f'import subprocess, sys\nsubprocess.run([sys.executable, "train.py", "2"], cwd={str(repository)!r})\n'
     (tmp_path / "all.py").write_text(start)
     options = ("--regularizer", "my_module:Own(0.5)", "--guard", "garden")
-    done = run(*options, "--report", "report.json", "all.py", cwd=tmp_path)
-    assert "--guard" in done.stderr  # which has no model to clean
+    code, _ = launched(*options, "--report", "report.json", "all.py", cwd=tmp_path)
+    assert "--guard" in code  # which has no model to clean
     (child,) = json.loads((tmp_path / "report.json").read_text())["started"]
     assert (child["renders"]["regularized"], child["problem"]) == (2, None)
 
@@ -133,21 +155,23 @@ def test_every_rank_of_a_gsplat_trainer_draws_masks_of_its_own(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_process_that_trains_past_the_hook_fails_the_run(repository):
+@pytest.mark.parametrize(
+    ("script", "why"),
+    [
+        (FILES["train.py"], "not regularized"),  # from step 9 on, which never comes
+        ("import torch\ndef render():\n    import diff_gaussian_rasterization as missing\n", "ImportError"),
+    ],
+    ids=["trains past the hook", "cannot be hooked"],
+)
+def test_a_process_without_the_regularizer_fails_the_run(repository, launched, script, why):
+    (repository / "train.py").write_text(textwrap.dedent(script))
+    if why == "ImportError":
+        (repository / "diff_gaussian_rasterization.py").unlink()
     start = 'import subprocess, sys\nsubprocess.run([sys.executable, "train.py", "2"])\n'
     (repository / "both.py").write_text(start)
-    done = run("--dropout", 0.5, "--start", 9, "both.py", cwd=repository)
-    assert done.returncode == 1
-    assert re.search(r"ERROR: train\.py: .*not regularized", done.stderr)
-
-
-@pytest.mark.slow
-def test_why_a_process_was_not_hooked_is_the_error_of_the_run(tmp_path):
-    (tmp_path / "train.py").write_text("import torch\ndef render():\n    import diff_gaussian_rasterization\n")
-    (tmp_path / "all.py").write_text('import subprocess, sys\nsubprocess.run([sys.executable, "train.py"])\n')
-    done = run("--dropout", 0.5, "all.py", cwd=tmp_path)
-    assert done.returncode == 1
-    assert re.search(r"ERROR: train\.py: .*ImportError", done.stderr)
+    code, said = launched("--dropout", 0.5, "--start", 9, "both.py", cwd=repository)
+    assert code == 1
+    assert re.search(rf"ERROR: train\.py: .*{why}", said)
 
 
 @pytest.mark.parametrize(
@@ -237,15 +261,3 @@ assert len(matplotlib.cm.get_cmap('viridis', 7).colors) == 7
 def test_old_names_of_libraries_are_there_for_a_script(repository):
     (repository / "old.py").write_text(OLD)
     main([str(repository / "old.py")])
-
-
-@pytest.mark.slow
-def test_old_names_of_libraries_are_there_for_scripts_that_a_script_starts(repository):
-    text = (repository / "train.py").read_text()
-    (repository / "train.py").write_text(OLD + text)
-    start = 'import subprocess, sys\nsubprocess.run([sys.executable, "train.py", "2"], check=True)\n'
-    (repository / "both.py").write_text(start)
-    done = run("--dropout", 0.5, "both.py", cwd=repository)
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"train\.py, .*: 2 renders regularized", done.stderr)
-    assert not {"int", "float"} & set(vars(np))
