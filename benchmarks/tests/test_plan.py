@@ -1,14 +1,9 @@
 import dataclasses
 import math
-import signal
-import subprocess
-import sys
 from functools import partial
 
 import pytest
 from stand_ins.executor import Here
-from subprocesses import subprocess_environment
-from waiting import PATIENCE, until
 
 from benchmarks import plan as plan_module
 from benchmarks.plan import ALTERNATIVES, parts_of_a_step, plan_study, plan_table, shortened, variants
@@ -102,34 +97,6 @@ def test_a_training_that_fails_is_reported_and_the_others_go_on(options, short, 
     failing.clear()
     trained()
     assert "+0.00, +0.00" in (tmp_path / "plan_study.md").read_text()
-
-
-STUDY = """
-from dataclasses import replace
-from pathlib import Path
-import sweep_tasks
-from reference_trainer.scenes.options import SceneOptions
-from benchmarks import plan
-from reference_trainer.runs.executors import Processes
-from reference_trainer.studies.study import run_study
-from reference_trainer.training.config import TrainConfig
-study = plan.plan_study(SceneOptions("synthetic", downscale=8.0), config=TrainConfig(iterations=1), seeds=1)
-study = replace(study, measure=sweep_tasks.note_the_interruption_here)
-run_study(study, Path("out"), executor=Processes(1))
-"""
-
-
-@pytest.mark.slow
-def test_a_training_is_interrupted_with_its_study(tmp_path):
-    """However else a study may end, the tests of `Processes` end it so."""
-    environment = subprocess_environment()
-    study = subprocess.Popen(
-        [sys.executable, "-c", STUDY], cwd=tmp_path, env=environment, start_new_session=True, stderr=subprocess.DEVNULL
-    )
-    until((tmp_path / "started").exists)
-    study.send_signal(signal.SIGINT)
-    until((tmp_path / "interrupted").exists)
-    study.wait(timeout=PATIENCE)
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+from operator import itemgetter
 from pathlib import Path
 
 import pytest
@@ -31,12 +32,19 @@ def kill_the_one_who_waits(folder):
 
 
 @pytest.mark.slow
-def test_a_task_that_raises_is_an_outcome_with_its_traceback():
-    outcomes = dict(run_all(Processes(2), [Task(str(n), sweep_tasks.square, (n,)) for n in (2, 3)]))
-    assert outcomes[0] == Value(4)
-    assert isinstance(outcomes[1], Failure)
-    assert outcomes[1].error == "ValueError: three is refused"
-    assert "in square" in outcomes[1].traceback
+def test_every_task_has_a_process_with_its_share_of_the_processors_and_an_outcome(monkeypatch):
+    """Of four tasks one raises, one ends its process, and two tell about themselves."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(6)), raising=False)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    about = [Task(name, sweep_tasks.environment, ()) for name in "ab"]
+    tasks = [Task("3", sweep_tasks.square, (3,)), Task("leave", sweep_tasks.leave, ()), *about]
+    raised, left, *told = [outcome for _, outcome in sorted(run_all(Processes(2), tasks, retries=0), key=itemgetter(0))]
+    assert isinstance(raised, Failure)
+    assert raised.error == "ValueError: three is refused"
+    assert "in square" in raised.traceback
+    assert "exit code 7" in left.error
+    assert len({outcome.value[0] for outcome in told} | {os.getpid()}) == 3
+    assert [outcome.value[1] for outcome in told] == [3, 3]
 
 
 @pytest.mark.slow
@@ -49,22 +57,6 @@ def test_a_killed_worker_is_replaced_and_takes_no_other_task_with_it(tmp_path, s
     assert outcomes == {0: Value(25), 1: Value(4)}
     assert len(said) == 1
     assert re.match("victim: .*SIGKILL, .*memory", said[0])
-
-
-@pytest.mark.slow
-def test_a_worker_that_leaves_without_an_answer():
-    outcomes = dict(run_all(Processes(1), [Task("leave", sweep_tasks.leave, ())], retries=0))
-    assert "exit code 7" in outcomes[0].error
-
-
-@pytest.mark.slow
-def test_every_task_has_a_process_with_its_share_of_the_processors(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(6)), raising=False)
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    tasks = [Task(str(n), sweep_tasks.environment, ()) for n in range(2)]
-    values = [outcome.value for _, outcome in run_all(Processes(2), tasks)]
-    assert len({pid for pid, _ in values} | {os.getpid()}) == 3
-    assert [threads for _, threads in values] == [3, 3]
 
 
 @pytest.mark.slow
