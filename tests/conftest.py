@@ -5,6 +5,8 @@ import os
 # The tests are many small operations: a second thread only spins, and slows them down when the cores are busy. Torch
 # reads this when it is loaded, and the processes that tests start inherit it.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Nor has torch.compile enough to do for processes of its own, each of which would import torch.
+os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
 
 import signal
 import tempfile
@@ -18,6 +20,7 @@ import torch
 from devices import DEVICES
 from stand_ins.card import CARD, pretended_card, register_card
 from tiers import pytest_cmdline_main as pytest_cmdline_main
+from tiers import pytest_configure as cut_the_slow_tier
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -105,6 +108,7 @@ class _WithoutTriton:
 def pytest_configure(config):
     """Prepare what must be before the first test."""
     register_card()
+    cut_the_slow_tier(config)
     # No file of a test outlives it, so none need wait for the disk. Those of tests/reliability that pretend power cuts
     # do so in processes of their own.
     os.fsync = lambda handle: None

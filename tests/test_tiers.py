@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import tiers
+from pages import ROOT
 
 PLAIN = {"markexpr": "not slow", "usepdb": False, "trace": False, "capture": "fd", "collectonly": False}
 XDIST = {"numprocesses": None, "maxprocesses": None, "dist": "no", "tx": []}
@@ -55,3 +56,20 @@ def test_folders_run_on_all_processors_unless_asked_otherwise(args, options, pro
 
 def test_without_xdist_nothing_is_asked_of_it():
     assert not hasattr(asked(EVERYTHING), "numprocesses")
+
+
+@pytest.mark.parametrize(("text", "left_out"), [("", True), ("pytestmark = pytest.mark.slow", None)])
+def test_the_slow_tier_imports_no_file_without_a_slow_test(tmp_path, text, left_out):
+    (tmp_path / "test_x.py").write_text(text)
+    assert tiers.WithoutQuickFiles.pytest_ignore_collect(tmp_path / "test_x.py") is left_out
+    assert tiers.WithoutQuickFiles.pytest_ignore_collect(tmp_path) is None
+    assert tiers.WithoutQuickFiles.pytest_ignore_collect(ROOT / "benchmarks" / "tests" / "test_plan.py") is None
+
+
+def test_no_file_makes_tests_of_another_slow():
+    """Or they would be missing there; the two that are not collected run in Triton's interpreter."""
+    marking = [
+        path.name for folder in ("tests", "ca_reg", "reference_trainer") for path in (ROOT / folder).rglob("*.py")
+        if not path.name.startswith("test_") and "mark.slow" in path.read_text("utf-8")
+    ]  # fmt: skip
+    assert sorted(marking) == ["gsplat_lists.py", "interpreted.py", "tiers.py"]
