@@ -49,7 +49,7 @@ def picture(*_):
 """
 
 
-def test_forks_after_the_first_use():
+def test_forks_after_the_first_use_and_a_thread_that_outlives_the_main_one():
     """And no thread is left at the end: what still waits for the GIL then is unwound, which once aborted a process."""
     pytest.importorskip("numba")
     assert run(
@@ -77,31 +77,6 @@ with multiprocessing.get_context("fork").Pool(2) as pool:
     assert pool.map(picture, range(4)) == [expected] * 4
 assert picture() == expected
 assert threading.active_count() > 1
-"""
-    ) == "MainThread\n"  # fmt: skip
-
-
-def test_spawned_processes(tmp_path):
-    pytest.importorskip("numba")
-    script = tmp_path / "spawning.py"
-    script.write_text(
-        DRAW
-        + """
-if __name__ == "__main__":
-    expected = picture()
-    with multiprocessing.get_context("spawn").Pool(2) as pool:
-        assert pool.map(picture, range(2)) == [expected] * 2
-"""
-    )
-    subprocess.run([sys.executable, str(script)], env=subprocess_environment(), check=True, timeout=300)
-
-
-def test_a_thread_that_outlives_the_main_one_still_renders():
-    pytest.importorskip("numba")
-    assert "rendered" in run(
-        DRAW
-        + """
-expected = picture()
 def later():
     threading.main_thread().join()
     time.sleep(0.5)
@@ -109,32 +84,33 @@ def later():
     print("rendered", flush=True)
 threading.Thread(target=later).start()
 """
-    )
+    ) == "rendered\nMainThread\n"  # fmt: skip
 
 
-@pytest.mark.parametrize("count", ["1", "2"])
-def test_omp_num_threads_decides_for_the_loops(count):
+def test_a_spawned_process(tmp_path):
     pytest.importorskip("numba")
-    out = run(
-        """
+    script = tmp_path / "spawning.py"
+    script.write_text(
+        DRAW
+        + """
+if __name__ == "__main__":
+    expected = picture()
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.map(picture, range(1)) == [expected]
+"""
+    )
+    subprocess.run([sys.executable, str(script)], env=subprocess_environment(), check=True, timeout=300)
+
+
+THREADS = """
 import threading, time, torch
 from reference_trainer.render import describe_engine
 from reference_trainer.compiled.threads import in_threads
 used = []
 in_threads(lambda *_: time.sleep(0.05) or used.append(threading.get_ident()), 20, least=1)
 print(torch.get_num_threads(), len(set(used)), describe_engine("cpu"))
-""",
-        OMP_NUM_THREADS=count,
-    )
-    of_torch, used, described = out.split(maxsplit=2)
-    assert used == of_torch
-    assert f", {of_torch} thread" in described
-    assert int(of_torch) <= int(count)
-
-
-def test_what_does_not_render_does_not_import_numba():
-    out = run(
-        """
+"""
+IMPORTS = """
 import sys
 import ca_reg, reference_trainer.render
 from reference_trainer.cli import main
@@ -145,8 +121,17 @@ for command in ([], ["train"], ["compare"]):
         assert exit_.code == 0
 print("loaded:", [name for name in ("numba", "llvmlite") if name in sys.modules])
 """
-    )
-    assert out.endswith("loaded: []\n")
+
+
+@pytest.mark.parametrize(("count", "first"), [("1", IMPORTS), ("2", "")], ids=["1", "2"])
+def test_omp_num_threads_decides_for_the_loops_and_what_does_not_render_does_not_import_numba(count, first):
+    pytest.importorskip("numba")
+    lines = run(first + THREADS, OMP_NUM_THREADS=count).splitlines()
+    of_torch, used, described = lines[-1].split(maxsplit=2)
+    assert used == of_torch
+    assert f", {of_torch} thread" in described
+    assert int(of_torch) <= int(count)
+    assert not first or lines[-2] == "loaded: []"
 
 
 def hiding(*packages):
@@ -164,12 +149,20 @@ sys.meta_path[sys.meta_path.index(importlib.machinery.PathFinder)] = Hiding
 """
 
 
-def test_without_numba_everything_is_there(tmp_path):
+def test_without_numba_and_triton_everything_is_there(tmp_path):
+    """And that Triton is missing is an error only if it is asked for."""
     save_few(tmp_path / "start.ply")
     out = run(
-        hiding("numba", "llvmlite")
+        hiding("numba", "llvmlite", "triton")
         + f"""
 from reference_trainer.cli import main
+from reference_trainer.render import describe_engine, use_engine
+from reference_trainer.render.engine import engines_on
+print(describe_engine("cuda"), engines_on(torch.device("cuda")))
+try:
+    use_engine("triton")
+except ImportError as error:
+    print(error)
 out, start = {str(tmp_path / "run")!r}, {str(tmp_path / "start.ply")!r}
 train = ["train", "--downscale", "16", "--init", start, "--monitor-every", "0", "--dropout", "0.2"]
 main([*train, "--iterations", "3", "--out", out])
@@ -183,27 +176,12 @@ except SystemExit as exit_:
     print("code", exit_.code)
 """
     )
+    assert out.startswith("torch ('torch',)\n")
+    assert "pip install 'triton>=3.4'" in out
     assert "Engine: torch" in out
     assert "exact CA" in out
     assert "Nothing is left" in out
     assert out.endswith("code 2\n")
-
-
-def test_triton_that_is_missing_is_an_error_only_if_asked_for():
-    out = run(
-        hiding("triton")
-        + """
-from reference_trainer.render import describe_engine, use_engine
-from reference_trainer.render.engine import engines_on
-print(describe_engine("cuda"), engines_on(torch.device("cuda")))
-try:
-    use_engine("triton")
-except ImportError as error:
-    print(error)
-"""
-    )
-    assert out.startswith("torch ('torch',)\n")
-    assert "pip install 'triton>=3.4'" in out
 
 
 def test_a_numba_that_cannot_be_imported_is_as_good_as_none(tmp_path):
