@@ -1,12 +1,9 @@
 """Rows are independent in Adam: the surviving rows must move as if the others had never been there."""
 
 import copy
-import subprocess
-import sys
 
 import pytest
 import torch
-from subprocesses import subprocess_environment
 
 from reference_trainer.model.gaussians import Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer
@@ -196,16 +193,6 @@ def test_a_model_without_higher_bands():
     optimizer.select(torch.tensor([2]))
     run(optimizer, torch.tensor([2.0]), range(2, 4))
     assert optimizer.gaussians.sh_rest.shape == (1, 0, 3)
-
-
-@pytest.mark.slow
-def test_the_kernel_in_the_interpreter_passes_all_tests_of_this_file():
-    pytest.importorskip("triton")
-    command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", "-m", "not slow", __file__]
-    environment = subprocess_environment(TRITON_INTERPRET="1", CA_REG_ENGINE="triton")
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert " passed" in done.stdout
 
 
 def test_a_tensor_that_the_kernel_cannot_count_is_refused():

@@ -1,11 +1,8 @@
 import math
-import subprocess
-import sys
 
 import pytest
 import torch
 from strategies import begun
-from subprocesses import subprocess_environment
 
 from reference_trainer.model.gaussians import PARAMETERS, Gaussians
 from reference_trainer.model.optimizer import GaussianOptimizer
@@ -196,18 +193,6 @@ def seen_in(scene, gaussians: Gaussians, view, opacities) -> tuple[torch.Tensor,
     (rendering.image - view.image).square().sum().backward()
     splats = rendering.splats
     return splats.indices, splats.touched, splats.means.grad
-
-
-@pytest.mark.slow
-def test_the_kernel_in_the_interpreter_counts_the_same():
-    pytest.importorskip("triton")
-    command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", __file__]
-    environment = subprocess_environment(TRITON_INTERPRET="1", CA_REG_ENGINE="triton")
-    done = subprocess.run(
-        [*command, "-k", "are_counted or dilute or many_gaussians"], env=environment, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
-    assert "4 passed" in done.stdout
 
 
 @pytest.mark.parametrize("scale", [1e-2, 1e-25])  # the squares of the second are 0 in float32
