@@ -18,15 +18,16 @@ def test_memory_is_in_proportion_to_the_file(name, what, tmp_path):
     target.write(tmp_path)
     read_quietly(target, tmp_path)  # imports
     (tmp_path / target.file).write_bytes(EXPANDING[name, what](SIZE))
-    peaks = []
-    for _ in range(3):  # the least counts: what a thread that another test has left allocates is no part of reading
+    fixed = 100_000 if name != "checkpoint" else target.memory
+    bound, peaks = target.expansion * (tmp_path / target.file).stat().st_size + fixed, []
+    while len(peaks) < 3:  # the least counts: what a thread that another test has left allocates is no part of reading
         tracemalloc.start()
         read_quietly(target, tmp_path)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    peak = min(peaks)
-    fixed = 100_000 if name != "checkpoint" else target.memory
-    assert peak < target.expansion * (tmp_path / target.file).stat().st_size + fixed
+        if peaks[-1] < bound:
+            return
+    pytest.fail(f"peaks {peaks}, all of {bound} and more")
 
 
 def test_a_picture_is_converted_in_bands(tmp_path):

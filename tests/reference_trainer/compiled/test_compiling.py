@@ -171,10 +171,9 @@ def answer(process):
 def test_several_processes_at_once_and_another_processor(tmp_path):
     path, folder = tmp_path / "doubling.py", tmp_path / "cache"
     path.write_text(SOURCE)
-    together = [started(path, folder) for _ in range(4)]
+    together = [started(path, folder) for _ in range(3)]
     assert any([answer(process) for process in together])
-    assert answer(started(path, folder)) == []
     generic = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
     assert answer(started(path, folder, **generic)) == ["doubling.double"]
     assert answer(started(path, folder, **generic)) == []
-    assert answer(started(path, folder)) == []
+    assert answer(started(path, folder)) == []  # of the first three, beside those of the other processor
