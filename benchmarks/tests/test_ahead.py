@@ -1,11 +1,12 @@
 """The kernels compiled ahead of time for cards that differ most: nothing spills, and nothing grows unnoticed.
 
 They are NVIDIA's oldest, and one of AMD's with wide warps; `python -m benchmarks.gpu ahead` takes all cards that the
-installed Triton knows. In processes of their own: a kernel that was made for Triton's interpreter cannot be
+installed Triton knows. In a process of its own: a kernel that was made for Triton's interpreter cannot be
 compiled.
 """
 
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -22,24 +23,31 @@ with Triton 3.9."""
 SLACK = 1.5  # for other versions of Triton; a doubling of a loop or of registers is seen
 
 
-def run(*arguments):
+CODE = """
+import dataclasses, json
+from benchmarks.ahead import KERNELS, compile_ahead
+less = "project backward, c", "project backward, deg"
+some = [k for k in KERNELS if not (k.label.endswith(("degree 1", "degree 2")) or k.label.startswith(less))]
+found = {target: [dataclasses.asdict(compile_ahead(k, target)) for k in some] for target in ("sm_75", "gfx90a")}
+kernel = next(k for k in KERNELS if k.label == "composite backward")
+found["24 registers"] = compile_ahead(kernel, "sm_90", maxnreg=24).spills
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    """What one process compiles, but projections of one and two bands, and backward without depths: others do as much
+    and more; and a kernel with fewer registers than it needs."""
     environment = subprocess_environment(TRITON_INTERPRET="0", PYTHONPATH=str(ROOT))
-    return subprocess.run([sys.executable, *arguments], cwd=ROOT, env=environment, capture_output=True, text=True)
-
-
-def compiled(code):
-    """What a program that compiles with `benchmarks.ahead` prints, as JSON."""
-    done = run("-c", f"import dataclasses, json\nfrom benchmarks.ahead import *\nprint(json.dumps({code}))")
+    done = subprocess.run([sys.executable, "-c", CODE], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
     return json.loads(done.stdout.splitlines()[-1])
 
 
 @pytest.mark.parametrize("target", ["sm_75", "gfx90a"])
-def test_nothing_spills_or_takes_much_more_than_it_did(target):
-    """But projections of one and two bands, and backward without depths: others do as much and more."""
-    less = "endswith(('degree 1', 'degree 2')) or k.label.startswith(('project backward, c', 'project backward, deg'))"
-    some = f"[k for k in KERNELS if not (k.label.{less})]"
-    rows = compiled(f"[dataclasses.asdict(compile_ahead(k, {target!r})) for k in {some}]")
+def test_nothing_spills_or_takes_much_more_than_it_did(compiled, target):
+    rows = compiled[target]
     assert rows
     assert [row["kernel"] for row in rows if row["spills"]] == []
     for row in rows:
@@ -59,14 +67,15 @@ def test_the_table_of_the_page_has_the_numbers_of_the_bounds():
         assert most == [max(registers, same), nvidia, amd], name
 
 
-def test_a_spill_is_seen():
-    """With fewer registers than the kernel needs."""
-    kernel = "next(k for k in KERNELS if k.label == 'composite backward')"
-    assert compiled(f"compile_ahead({kernel}, 'sm_90', maxnreg=24).spills") > 0
+def test_a_spill_is_seen(compiled):
+    assert compiled["24 registers"] > 0
 
 
-def test_the_command_says_what_it_cannot_compile():
-    done = run("-m", "benchmarks.gpu", "ahead", "sm_10")
-    assert done.returncode == 1
-    assert "sm_10" in done.stdout
-    assert run("-m", "benchmarks.gpu", "behind").returncode == 2
+@pytest.mark.parametrize(("arguments", "code"), [(["ahead", "sm_10"], 1), (["behind"], 2)])
+def test_the_command_says_what_it_cannot_compile(arguments, code, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["gpu", *arguments])
+    monkeypatch.delitem(sys.modules, "benchmarks.gpu", raising=False)  # runpy warns of what is there already
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("benchmarks.gpu", run_name="__main__")
+    assert ended.value.code == code
+    assert arguments[-1] in "".join(capsys.readouterr())
