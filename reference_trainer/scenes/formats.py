@@ -125,7 +125,7 @@ def find_reader(root: Path, name: str) -> Reader:
         )
     raise ValueError(
         f"{root} has none of {', '.join(format.sign for format in FORMATS.values())}; it has "
-        f"{sorted(entry.name for entry in root.iterdir())[:20]}."
+        f"{', '.join(sorted(entry.name for entry in root.iterdir())[:20]) or 'nothing'}."
     )
 
 

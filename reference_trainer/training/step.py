@@ -84,9 +84,9 @@ class Step:
     sh_degree: int
     seed: int
     renderer: Callable[..., Any]
-    absgrad: bool
-    label: str
-    siblings: Sequence[Step]
+    absgrad: bool = False
+    label: str = ""
+    siblings: Sequence[Step] = ()
     image: Tensor = field(init=False)
     rendered: Params = field(init=False)
     variance: Tensor | None = field(default=None, init=False)
