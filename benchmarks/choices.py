@@ -16,8 +16,10 @@ from typing import Literal
 from benchmarks.paper.rows import value
 from benchmarks.paper.scenes import SCENES
 from benchmarks.setting import (
+    ANY_COLOR,
     BINOCULAR,
     DISTILLED,
+    ELSEWHERE,
     FEWEST,
     HALF,
     HELD_OUT,
@@ -39,10 +41,11 @@ from benchmarks.start_scenes import from_dense, from_today
 from reference_trainer.evaluation.tables import format_mean_std, markdown_table, mean_std
 
 __all__ = [
-    "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_DEFAULT", "BY_TODAYS", "CHOICES", "DROPOUT_ALONE",
+    "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_ANY_COLOR", "BY_DEFAULT", "BY_SMOOTH",
+    "BY_TODAYS", "CHOICES", "DROPOUT_ALONE",
     "ENSEMBLE", "EVEN", "EVEN_OVER_PLAIN", "KINDS", "LEFT_OUT", "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER",
-    "SLOWER_MEANS", "TODAYS_BESIDE_BINOCULAR", "UNEVEN", "WITHOUT", "Choice", "figures_of", "from_same_start",
-    "gains_of", "pairs_of", "tables",
+    "SLOWER_MEANS", "SMOOTH", "SMOOTH_AND_EVEN", "TODAYS_BESIDE_BINOCULAR", "UNEVEN", "WITHOUT",
+    "Choice", "figures_of", "from_same_start", "gains_of", "pairs_of", "tables",
 ]  # fmt: skip
 
 
@@ -81,6 +84,7 @@ _SHORTER = (
 _OVER_MEAN = (MEAN_BACKGROUND, f"random background + {MEAN_BACKGROUND}")
 _BEGINNINGS = ("opaque", "small", "opaque + small", "large")
 _WITHOUT = "without dropout", "without decay"
+_SMOOTH = "smooth 0.1", "smooth 0.5", ELSEWHERE
 _COUNTS = ("5,000 dense and few", "8,000 dense and few", "30,000 dense and few", "filled")
 CHOICES = {
     "third": Choice(("rate 0.3", "no reset", "threshold 3e-4"), seeds=(0,)),
@@ -103,9 +107,14 @@ CHOICES = {
     "nineteenth": Choice(_BEGINNINGS, seeds=range(3), figure="shared", begun=from_today),
     "nineteenth, second round": Choice(_BEGINNINGS, seeds=range(3), tried=(0, 1, 2), figure="shared", begun=from_today),
     "twentieth": Choice(("random background",), seeds=(3, 4, 5), tried=(3, 4, 5), begun=from_today),
-    "twenty-third": Choice((f"limit 0.2 + {MEAN_BACKGROUND}",), seeds=(2,), tried=(2,), begun=from_today, over=TODAY),
-    "twenty-fourth": Choice(_WITHOUT, seeds=(0,), begun=from_today, over=TODAY),
-    "twenty-fifth": Choice((ONE_EXPOSURE,), seeds=range(6), tried=tuple(range(6)), begun=from_today, over=TODAY),
+    "twenty-third": Choice(
+        (f"limit 0.2 + {MEAN_BACKGROUND}",), seeds=(2,), tried=(2,), begun=from_today, over=ANY_COLOR
+    ),
+    "twenty-fourth": Choice(_WITHOUT, seeds=(0,), begun=from_today, over=ANY_COLOR),
+    "twenty-fifth": Choice((ONE_EXPOSURE,), seeds=range(6), tried=tuple(range(6)), begun=from_today, over=ANY_COLOR),
+    "twenty-sixth": Choice(_SMOOTH, seeds=(0,), begun=from_today, over=ANY_COLOR),
+    "twenty-sixth, by shared pixels": Choice(_SMOOTH, range(3), (0, 1, 2), "shared", begun=from_today, over=ANY_COLOR),
+    "twenty-seventh": Choice((ONE_EXPOSURE,), range(6), tuple(range(6)), "shared", begun=from_today, over=TODAY),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
@@ -117,16 +126,16 @@ DROPOUT_ALONE = {"plain": "plain", "dropout": "dropout alone"}
 """What the two lines of the README gain from there."""
 BY_DEFAULT = {"plain": "plain", LATER: "recipe"}
 """What the recipe gained from the start that a user has: from the dense start as it was, and as it is now."""
-BY_TODAYS = {"plain": "plain", TODAY: "recipe"}
-"""What it gains today."""
+BY_ANY_COLOR = {"plain": "plain", ANY_COLOR: "recipe"}
+"""What it gained there up to the twenty-fifth choice."""
 UNEVEN = ("herz-jesu", "sceaux")
 """The scenes whose photographs differ in exposure."""
 EVEN = tuple(
     {name: title, f"{name} + {ONE_EXPOSURE}": f"{title}, {ONE_EXPOSURE}"}
-    for name, title in ((TODAY, "recipe"), ("plain", "plain"), (f"{BINOCULAR}{RELATIVE}", BINOCULAR))
+    for name, title in ((ANY_COLOR, "recipe"), ("plain", "plain"), (f"{BINOCULAR}{RELATIVE}", BINOCULAR))
 )
 """What the twenty-fifth choice adds to the recipe, to plain trainings and to Binocular3DGS's."""
-EVEN_OVER_PLAIN = {"plain": "plain", f"{TODAY} + {ONE_EXPOSURE}": f"recipe, {ONE_EXPOSURE}"}
+EVEN_OVER_PLAIN = {"plain": "plain", f"{ANY_COLOR} + {ONE_EXPOSURE}": f"recipe, {ONE_EXPOSURE}"}
 """What the recipe would gain with it over plain trainings as they are."""
 
 ENSEMBLE = {"plain": "plain", f"{LATER} + {DISTILLED[2]}": DISTILLED[2]}
@@ -145,19 +154,27 @@ BESIDE_BINOCULAR = tuple(
     for name in (DISTILLED[2], _THREE_KINDS, _WITH_BINOCULAR, *_SHORTER[2:])
 )
 """All these beside Binocular3DGS, from the start that a user has."""
-TODAYS_BESIDE_BINOCULAR = {f"{BINOCULAR}{RELATIVE}": BINOCULAR, TODAY: "recipe"}
+SMOOTH = {ANY_COLOR: "before", TODAY: "smooth 0.1"}
+"""The judgement of the twenty-sixth choice."""
+SMOOTH_AND_EVEN = {TODAY: "smooth 0.1", f"{TODAY} + {ONE_EXPOSURE}": "and one exposure"}
+"""That of the twenty-seventh."""
+BY_TODAYS = {"plain": "plain", f"{TODAY} + {ONE_EXPOSURE}": "smooth 0.1, one exposure"}
+"""What both gain over plain trainings as they are: what `ca-reg run` does today."""
+BY_SMOOTH = {"plain": "plain", TODAY: "smooth 0.1"}
+"""What the recipe gains alone."""
+TODAYS_BESIDE_BINOCULAR = {f"{BINOCULAR}{RELATIVE}": BINOCULAR, f"{TODAY} + {ONE_EXPOSURE}": "recipe, one exposure"}
 """The recipe beside it, from the start as it is now."""
 QUALITY = {
-    f"{TODAY} + 5,000 steps": "one of 5,000",
+    f"{ANY_COLOR} + 5,000 steps": "one of 5,000",
     f"{LATER} + distilled with {HALF}": "two of 3,000",
     f"{LATER} + distilled with 2,500 steps": "two of 5,000",
-    f"{TODAY} + D-SSIM 0.4 + 5,000 steps": "one of 5,000, sharper",
+    f"{ANY_COLOR} + D-SSIM 0.4 + 5,000 steps": "one of 5,000, sharper",
     f"{LATER} + threshold 3e-4 + random background + D-SSIM 0.4 + 5,000 steps": "one of 5,000, sharper and finer",
 }
 """What the twenty-second choice trained for `ca-reg run --quality`, in rows of photographs as they are kept."""
-WITHOUT = {"plain": "plain", TODAY: "recipe"} | {f"{TODAY} + {name}": name for name in _WITHOUT}
+WITHOUT = {"plain": "plain", ANY_COLOR: "recipe"} | {f"{ANY_COLOR} + {name}": name for name in _WITHOUT}
 """What the twenty-fourth leaves out, beside what it leaves it out of."""
-LEFT_OUT = tuple({TODAY: "recipe", f"{TODAY} + {name}": name} for name in _WITHOUT)
+LEFT_OUT = tuple({ANY_COLOR: "recipe", f"{ANY_COLOR} + {name}": name} for name in _WITHOUT)
 """The same, each held against the recipe."""
 _UNITS = {
     "held-out": ("held-out", 1.0),
@@ -179,7 +196,10 @@ def tables(rows: Sequence[Row]) -> list[str]:
     if any(row["candidate"] == next(iter(QUALITY)) for row in rows):
         return [figures_of(rows, QUALITY, "{held-out:.2f} / {psnr:.2f}, {lpips:.3f}, {thousands:.0f}, {seconds:.0f} s")]
     gained = [gains_of(rows, choice) for choice in CHOICES.values()]
-    of_today = (BY_DEFAULT, BY_TODAYS, TODAYS_BESIDE_BINOCULAR, *LEFT_OUT, *EVEN, EVEN_OVER_PLAIN)
+    of_today = (
+        BY_DEFAULT, BY_ANY_COLOR, TODAYS_BESIDE_BINOCULAR, *LEFT_OUT, *EVEN, EVEN_OVER_PLAIN, SMOOTH, SMOOTH_AND_EVEN,
+        BY_SMOOTH, BY_TODAYS,
+    )  # fmt: skip
     today = [from_same_start(rows, titles, from_today) for titles in of_today]
     without = figures_of(rows, WITHOUT, "{psnr:.2f}, {lpips:.3f}, {score:.2f}, {thousands:.0f}", (0,))
     return [*gained, *(from_same_start(rows, titles) for titles in _JUDGED), *today, without]
@@ -237,7 +257,7 @@ def _on(scene: str, name: str) -> str:
     Where photographs show the background, it stays, and where they do not differ in exposure, they do.
     """
     name = name if scene in UNEVEN else name.removesuffix(f" + {ONE_EXPOSURE}")
-    return name.replace(TODAY, LATER) if scene in SHOWN else name
+    return name.replace(ANY_COLOR, LATER) if scene in SHOWN else name
 
 
 def _rows(rows: Sequence[Row], scene: str, name: str, begun: Callable[[str], str]) -> dict[int, Row]:

@@ -95,6 +95,8 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "opacities x1/2": ("opacity_rate", 0.025),
     "scales x1/2": ("scales_rate", 2.5e-3),
     "colors x1/2": ("color_rate", 1.25e-3),
+    "smooth 0.1": ("loss", "smooth_depth(between(0.1,"),
+    "smooth 0.5": ("loss", "smooth_depth(between(0.5,"),
     "without dropout": ("dropout", 0.0),
     "without decay": ("opacity_decay", 1.0),
 }
@@ -105,16 +107,18 @@ CHOSEN = "drawn"
 """What the first choice chose, and the second started from: ``--recipe sparse --densify-from 150``."""
 LATER = "from 1,000"
 """What the second choice chose: ``--recipe sparse --random-background off``."""
-TODAY = f"{LATER} + random background"
-"""What the twentieth chose: ``--recipe sparse``, but on `SHOWN`."""
+ANY_COLOR = f"{LATER} + random background"
+"""What the twentieth chose: ``--recipe sparse --loss photometric``, but on `SHOWN`."""
+TODAY = f"{ANY_COLOR} + smooth 0.1"
+"""What the twenty-seventh chose: ``--recipe sparse``, but on `SHOWN`."""
 SHOWN = ("dtu-scan65", "dtu-scan24", "lego")
 """The scenes whose photographs show the background, over which the recipe stays."""
 DENSE = "from 1,000, dense start"
 """The same as a user has it, with the start that it has by default."""
 ONE_EXPOSURE = "one exposure"
 """What the tenth choice adds: photographs made equally bright, ``--one-exposure``."""
-MEAN_BACKGROUND = "mean background"
-"""What the eighteenth choice tried; its code was not kept."""
+MEAN_BACKGROUND, ELSEWHERE = "mean background", "smooth 0.5 elsewhere"
+"""What the eighteenth and the twenty-sixth choice tried; the code of neither was kept."""
 DISTILLED = {1: "distilled, alone", 2: "distilled of two", 3: "distilled of three"}
 """What the eleventh choice adds, by the number of models."""
 TWICE, HALF, THIRD = "twice the steps", "half the steps", "a third of the steps"
@@ -177,9 +181,11 @@ def main(
     elif what == "shared":
         rows = json.loads(out.read_text("utf-8"))
         options, config = read_run_settings(paths[0] / "config.json")
-        views = shared(*load_run_model(paths[0]), held_out_views(options, config.seed))
+        masks = {x.name: x.mask for x in shared(*load_run_model(paths[0]), held_out_views(options, config.seed))}
         for run in paths[1:]:
             options, config = read_run_settings(run / "config.json")
+            own = (view for view in held_out_views(options, config.seed) if view.name in masks)  # of its exposure
+            views = [dataclasses.replace(view, mask=masks[view.name]) for view in own]
             row = rows_of(rows, _scene(options), candidate(config, options))[config.seed]
             row["shared"] = fmean(quality(load_run_model(run)[0], view) for view in views)
             write_json(out, rows)
@@ -215,7 +221,8 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
         shown = options is not None and Path(options.path).name in SHOWN
         config = dataclasses.replace(config, random_background="off" if shown else "on")
     if "distillation(" in config.loss:
-        learner = "plain" if not config.dropout else LATER if config.random_background == "off" else TODAY
+        smooth = " + smooth 0.1" * ("smooth_depth(" in _members(config.loss)[0].loss)
+        learner = (LATER if config.random_background == "off" else ANY_COLOR) + smooth if config.dropout else "plain"
         return f"{learner} + {_distilled(config.loss)}"
     begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
     if config.analytic:
@@ -235,14 +242,18 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
     return name + (f", {LATER}" if begins == 1_000 else "")
 
 
+def _members(loss: str) -> list[TrainConfig]:
+    """Return the settings of the models that a loss distills."""
+    return [read_run_settings(Path(ply).parent / "config.json")[1] for ply in re.findall(r"'([^']*\.ply)'", loss)]
+
+
 def _distilled(loss: str) -> str:
     """Return which models a loss distills: how many, or if they are of several kinds, which the others are."""
-    runs = [Path(ply).parent for ply in re.findall(r"'([^']*\.ply)'", loss)]
-    members = (read_run_settings(run / "config.json")[1] for run in runs)
+    members = _members(loss)
     first, *others = (candidate(dataclasses.replace(member, random_background="off")) for member in members)
     kinds = [other.removeprefix(f"{LATER} + ") for other in others if other != first]
     steps = [f", {part}" for part in first.split(" + ") if part in _STEPS.values()]
-    return f"distilled with {', '.join(kinds)}" if kinds else "".join([DISTILLED[len(runs)], *steps])
+    return f"distilled with {', '.join(kinds)}" if kinds else "".join([DISTILLED[len(members)], *steps])
 
 
 def measured(run: Path, perceptual: LPIPS | None = None) -> Row:
@@ -457,7 +468,7 @@ def _is_second(candidate: str) -> bool:
     return (
         names <= _SECOND.keys()
         or "distilled" in candidate
-        or bool(names & {ONE_EXPOSURE, MEAN_BACKGROUND, *_STEPS.values()})
+        or bool(names & {ONE_EXPOSURE, MEAN_BACKGROUND, ELSEWHERE, *_STEPS.values()})
     )
 
 

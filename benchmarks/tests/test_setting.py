@@ -14,7 +14,7 @@ from reference_trainer.runs.folder import run_settings
 from reference_trainer.scenes.options import SceneOptions
 from reference_trainer.training.recipes import with_recipe
 
-former = partial(with_recipe, random_background="off")
+former = partial(with_recipe, random_background="off", loss="photometric")
 """A recipe as it was up to the twentieth choice."""
 
 
@@ -100,8 +100,8 @@ def test_the_recipe_is_what_was_chosen():
     for iterations in (2_000, 3_000):
         config = with_recipe("sparse", iterations=iterations)
         assert setting.candidate(config) == setting.TODAY
-        assert setting.candidate(config, SceneOptions("data/lego")) == setting.LATER
-    first = with_recipe("sparse", iterations=2_000, densify_from=100, random_background="off")
+        assert setting.candidate(config, SceneOptions("data/lego")) == f"{setting.LATER} + smooth 0.1"
+    first = former("sparse", iterations=2_000, densify_from=100)
     assert setting.candidate(first) == setting.CHOSEN
     assert setting.candidate(with_recipe("3dgs", iterations=3_000)) == "plain"
     assert setting.candidate(with_recipe("3dgs", iterations=3_000, densify_from=1_000)) == "plain, from 1,000"

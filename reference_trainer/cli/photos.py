@@ -95,8 +95,8 @@ class Run:
     """Initial points, as for `ca-reg train`, such as "dense"."""
     test: Literal["none", "auto"] = "none"
     """"auto" holds photographs out to measure the quality at, as `ca-reg train` does; by default all of them train."""
-    one_exposure: bool = False
-    """Make photographs of different exposure or white balance equally bright, as `ca-reg train` does."""
+    one_exposure: bool = True
+    """Make photographs of different exposure or white balance equally bright."""
     open: bool = True
     """Open the page in a browser, where there is one."""
     device: Device = "cpu"

@@ -66,7 +66,8 @@ def step_seconds(width: int, height: int, device: str = "cpu") -> float:
         View(view.name, view.camera.resized(width, height), resize_image(view.image, width, height))
         for view in scene.train
     )
-    trainer = Trainer(replace(scene, train=views), TrainConfig(dropout=0.2), device)
+    config = TrainConfig(dropout=0.2, loss="photometric + smooth_depth(0.1)")  # as two of three steps of sparse
+    trainer = Trainer(replace(scene, train=views), config, device)
     with threads_for(width * height):
         for number in range(_UNTIMED + _TIMED):
             if number == _UNTIMED:

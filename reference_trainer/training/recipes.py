@@ -138,9 +138,10 @@ RECIPES: dict[str, Recipe] = {
             dropout=0.2,
             opacity_decay=0.995,
             random_background="auto",
+            loss="photometric + smooth_depth(between(0.1, 1000))",
         ),  # the schedule of 3dgs at 3,000 steps, but for the beginning of density control
         "no publication: 3dgs densified later, dropout (Chen et al. 2025), Binocular3DGS's opacity decay, CoR-GS's "
-        "random background, our guard",
+        "random background, Monodepth2's smoothness, our guard",
         "nothing; benchmarks/setting.md says how it was chosen",
     ),
     "distilled": Recipe(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pages import ROOT
 
-from benchmarks.choices import BY_DEFAULT, BY_TODAYS, pairs_of
+from benchmarks.choices import BY_ANY_COLOR, BY_DEFAULT, BY_SMOOTH, BY_TODAYS, pairs_of
 from benchmarks.paper import figure as figure_module
 from benchmarks.paper.cells import Grid, declared, estimate, is_done, rows_of
 from benchmarks.paper.claims import CLAIMS, Check, Claim, chosen
@@ -285,7 +285,8 @@ def test_no_scene_is_left_out_of_what_is_said_of_dropout():
 def test_what_the_recommended_setting_gained_is_what_was_measured():
     """The ranges of the rule against all kept pairs, the figures of the pages against those from today's start."""
     rows = json.loads((ROOT / "benchmarks" / "data" / "setting.json").read_text("utf-8"))
-    judged = ((BY_DEFAULT, from_dense), (BY_DEFAULT, from_today), (BY_TODAYS, from_today))
+    since = (BY_DEFAULT, BY_ANY_COLOR, BY_SMOOTH, BY_TODAYS)
+    judged = ((BY_DEFAULT, from_dense), *((titles, from_today) for titles in since))
     *former, started = (
         {scene: [after - before for before, after in of] for scene, of in pairs_of(rows, titles, begun).items()}
         for titles, begun in judged

@@ -166,21 +166,24 @@ class SmoothDepth(WeightedTerm):
     """``weight`` times kornia's inverse_depth_smoothness_loss of ``alpha / depth`` over its mean (Monodepth2, 2019).
 
     ``sum over x and y of mean |dD| exp(-mean |dI|)``: forward differences, I the photograph, D the inverse mean depth
-    of a pixel, 0 where nothing is rendered, divided by its own mean so that the unit of length does not matter.
+    of a pixel, 0 where nothing is rendered, divided by its own mean so that the unit of length does not matter. An
+    analytic step has no depth: there the plain model is rendered for it.
 
     Args:
-        weight: at least 0, or a schedule. Monodepth2 uses 0.001.
+        weight: at least 0, or a schedule. Monodepth2 uses 0.001, the recipe ``sparse`` 0.1 after a third of the steps.
     """
 
     needs = frozenset({"depth"})
+    analytic = True
 
     def __init__(self, weight: float | Schedule = 0.001) -> None:
         super().__init__(weight)
 
     def value(self, step: Step) -> Tensor:
         """Return the smoothness of the view."""
-        assert step.rendering is not None
-        inverse = step.rendering.alpha / step.depth.clamp_min(1e-8)
+        rendering = step.rendering or step.render(step.view.camera, depth=True)
+        assert rendering.depth is not None
+        inverse = rendering.alpha / rendering.depth.clamp_min(1e-8)
         inverse = inverse / inverse.mean().clamp_min(1e-12)
         return inverse_depth_smoothness_loss(inverse[None, None], step.view.image[None])
 

@@ -204,6 +204,7 @@ WEIGHTS = {
         "Opacity": lambda i: 0.001 / 1.2,
     },
     "mvgs": {"Views": lambda i: 1.0},
+    "sparse": {"SmoothDepth": lambda i: 0.1 * (i > 1_000)},
     "distilled": {"Distillation": lambda i: 1.0},
     "corgs": {"CoRegularization": lambda i: float(i > 500)},
     "segs": {"CoRegularization": lambda i: float(i > 500)},
@@ -224,10 +225,12 @@ def test_terms_act_when_those_of_the_code_base_do(name, share):
                 assert sum(weights) == pytest.approx(weight(iteration), abs=1e-6), (kind, iteration)
 
 
-def test_sparse_is_3dgs_of_as_many_steps_with_five_options():
-    """Dropout, decay, the guard at the end, a background of any color, density control from a third on."""
+def test_sparse_is_3dgs_of_as_many_steps_with_six_options():
+    """Dropout, decay, the guard at the end, any color behind, density control and smooth depth from a third on."""
     for iterations in (1_000, 1_500, 3_000):
-        options = {"dropout": 0.2, "opacity_decay": 0.995, "guard": iterations, "densify_from": round(iterations / 3),
+        third = round(iterations / 3)
+        loss = f"photometric + smooth_depth(between(0.1, {third}))"
+        options = {"dropout": 0.2, "opacity_decay": 0.995, "guard": iterations, "densify_from": third, "loss": loss,
                    "random_background": "auto"}  # fmt: skip
         assert with_recipe("sparse", iterations=iterations) == with_recipe("3dgs", iterations=iterations, **options)
 

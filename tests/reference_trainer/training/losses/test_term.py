@@ -55,7 +55,7 @@ def test_terms_look_at_the_photographs_before_the_first_step(tiny_scene):
 
 @pytest.mark.parametrize("name", list(LOSSES))
 def test_analytic_training_refuses_what_needs_a_draw_and_nothing_else(name):
-    needs_one = name in {"pearson", "patch_depth", "warp", "smooth_depth", "alpha", "straight_through"}
+    needs_one = name in {"pearson", "patch_depth", "warp", "alpha", "straight_through"}
     with pytest.raises(ValueError, match=r"analytic .*no draw") if needs_one else nullcontext():
         check(TrainConfig(dropout=0.2, analytic=True, models=2, loss=f"photometric + {name}"))
 
