@@ -103,11 +103,11 @@ def test_what_forks_of_a_script_did_is_reported(repository, tmp_path):
 
 @pytest.mark.slow
 def test_relative_paths_of_the_options_hold_in_a_process_that_starts_elsewhere(repository, launched, tmp_path):
-    (tmp_path / "my_module.py").write_text("from ca_reg import GaussianDropout as Own\n")
+    (tmp_path / "own_module.py").write_text("from ca_reg import GaussianDropout as Own\n")
     (tmp_path / "garden").mkdir()
     start = f'import subprocess, sys\nsubprocess.run([sys.executable, "train.py", "2"], cwd={str(repository)!r})\n'
     (tmp_path / "all.py").write_text(start)
-    options = ("--regularizer", "my_module:Own(0.5)", "--guard", "garden")
+    options = ("--regularizer", "own_module:Own(0.5)", "--guard", "garden")
     code, _ = launched(*options, "--report", "report.json", "all.py", cwd=tmp_path)
     assert "--guard" in code  # which has no model to clean
     (child,) = json.loads((tmp_path / "report.json").read_text())["started"]
