@@ -1,7 +1,8 @@
 """The renderer: tensors and a camera in, a picture out. It knows neither scenes nor the model.
 
-Three engines render: loops compiled by numba for float32 on a CPU, Triton kernels for float32 on a card, and PyTorch
-operations for everything else, which the others are tested against. `use_engine` chooses.
+Three engines render: loops compiled by numba for float32 on a CPU, Triton kernels for float32 on a
+card, and PyTorch operations for everything else, which the others are tested against. `use_engine`
+chooses.
 """
 
 from reference_trainer.render.checks import NotFiniteError

@@ -1,6 +1,7 @@
 """What the renderer refuses: numbers that are not finite, coordinates too large for float32.
 
-A nan would go unnoticed otherwise: a Gaussian whose depth is nan does not lie in front of the camera, and is culled.
+A nan would go unnoticed otherwise: a Gaussian whose depth is nan does not lie in front of the
+camera, and is culled.
 """
 
 from __future__ import annotations

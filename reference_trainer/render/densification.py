@@ -37,7 +37,8 @@ def in_front(means: Tensor, camera: Camera) -> Tensor:
 def longer_radii(covariances: Tensor, smallest: float) -> Tensor:
     """Return three standard deviations of the longer axis of 2D covariances (M, 3), rounded up, at most `MAX_RADIUS`.
 
-    More for round splats: half the difference of the axes' variances counts as at least ``smallest``.
+    More for round splats: half the difference of the axes' variances counts as at least
+    ``smallest``.
 
     Example:
         >>> longer_radii(torch.tensor([[1.0, 0.0, 1.0], [9.0, 0.0, 1.0]]), SMALLEST_SPREAD).tolist()  # 3 sqrt(1.32), 9

@@ -86,8 +86,9 @@ def render(
 ) -> Rendering:
     """Render 3D Gaussians; differentiable in every tensor, once: second derivatives lack what the pixels add.
 
-    Convention: OpenCV camera, half-pixel centers, wxyz quaternions; the constants of the INRIA rasterizer. The work is
-    done in float64 if the means are, else in float32: also for float16 and bfloat16 inputs, and inside torch.autocast.
+    Convention: OpenCV camera, half-pixel centers, wxyz quaternions; the constants of the INRIA
+    rasterizer. The work is done in float64 if the means are, else in float32: also for float16 and
+    bfloat16 inputs, and inside torch.autocast.
 
     Args:
         means: world coordinates, shape (N, 3).
@@ -164,7 +165,8 @@ def render_moments(splats: Splats, multiplier: Multiplier, *, background: Tensor
         splats: of the full model, with its plain opacities.
         multiplier: moments of the factor, numbers for all Gaussians, or tensors of shape (N,) or (N, 1),
             one value each.
-        background: fixed color behind everything, shape (3,), or one for each pixel, (3, H, W); black by default.
+        background: fixed color behind everything, shape (3,), or one for each pixel, (3, H, W);
+            black by default.
 
     Raises:
         ValueError: if the background has another shape, or is not finite.
@@ -192,8 +194,9 @@ def variance_shares(
     The shares add up to it. A Gaussian's share at a pixel is its summand of the variance,
     `ca_reg.functional.contributions`, mean over RGB.
 
-    The weights have shape (H, W); 1 / count in the region of a score gives shares of that score. Other arguments are
-    those of `render_moments`. Returns one share for every projected Gaussian (``splats.indices``), (M,), float64.
+    The weights have shape (H, W); 1 / count in the region of a score gives shares of that score.
+    Other arguments are those of `render_moments`. Returns one share for every projected Gaussian
+    (``splats.indices``), (M,), float64.
 
     Raises:
         ValueError: if the weights or the background have another shape.

@@ -65,10 +65,12 @@ class TileLists:
     Args:
         width: image width, pixels.
         height: image height, pixels.
-        starts: where each tile's list starts, row by row over the image, and where the last ends, shape (tiles + 1,).
+        starts: where each tile's list starts, row by row over the image, and where the last ends,
+            shape (tiles + 1,).
         gaussians: the indices of the listed Gaussians, tile after tile, shape (P,).
         touched: whether a Gaussian is in any list, shape (M,) bool.
-        slots: a unique number for every entry, consecutive for each Gaussian, shape (P,); the loops need them.
+        slots: a unique number for every entry, consecutive for each Gaussian, shape (P,); the loops
+            need them.
         offsets: each Gaussian's first slot, and the number of all, shape (M + 1,); likewise.
     """
 
@@ -173,8 +175,9 @@ class MomentImages(NamedTuple):
 class Engine(Protocol):
     """What renders: turns Gaussians into images, and into the exact moments of images.
 
-    All tensors of a call share one dtype and one device, and have been checked (`reference_trainer.render.renderer`);
-    results are differentiable unless said otherwise. A new engine is to be added to `reference_trainer.render.engine`.
+    All tensors of a call share one dtype and one device, and have been checked
+    (`reference_trainer.render.renderer`); results are differentiable unless said otherwise. A new
+    engine is to be added to `reference_trainer.render.engine`.
     """
 
     name: str
@@ -184,22 +187,25 @@ class Engine(Protocol):
     ) -> Projected:
         """Project the Gaussians that lie in view and evaluate their colors.
 
-        These are the ones beyond `NEAR_PLANE` with an opacity of at least `MIN_ALPHA`. The inputs, by name, are means
-        (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh (N, K, 3), used up to band ``degree``,
-        or colors (N, 3), whose ``degree`` is None. A background (3,) is checked with the numbers.
+        These are the ones beyond `NEAR_PLANE` with an opacity of at least `MIN_ALPHA`. The inputs,
+        by name, are means (N, 3), quaternions (N, 4), scales (N, 3), opacities (N,), and either sh
+        (N, K, 3), used up to band ``degree``, or colors (N, 3), whose ``degree`` is None. A
+        background (3,) is checked with the numbers.
         """
 
     def bin(self, projected: Projected, width: int, height: int) -> TileLists:
         """List the Gaussians of every tile.
 
-        A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the rectangle spanned by the
-        tile's pixel centers. The test is exact: within a row of tiles, an ellipse covers an interval of columns.
+        A Gaussian belongs to a tile if the ellipse on which its alpha is `MIN_ALPHA` meets the
+        rectangle spanned by the tile's pixel centers. The test is exact: within a row of tiles, an
+        ellipse covers an interval of columns.
         """
 
     def masked(self, splats: Splats, opacities: Tensor) -> Splats:
         """Return the splats with lower opacities (M,), reusing projection and lists.
 
-        None may be higher than before: the lists would be too short. Splats below `MIN_ALPHA` cost nothing.
+        None may be higher than before: the lists would be too short. Splats below `MIN_ALPHA` cost
+        nothing.
         """
 
     def composite(self, splats: Splats, background: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -224,7 +230,8 @@ class Engine(Protocol):
     def moments(self, splats: Splats, multiplier: Tensor, background: Tensor) -> MomentImages:
         """Return mean and variance of every pixel under random factors on the alphas.
 
-        ``multiplier`` (M, 2) holds mean and variance of every splat's factor, the background is (3, H, W).
+        ``multiplier`` (M, 2) holds mean and variance of every splat's factor, the background is (3,
+        H, W).
         """
 
     def shares(self, splats: Splats, multiplier: Tensor, background: Tensor, weights: Tensor) -> Tensor:

@@ -49,7 +49,8 @@ def _squared_radius(opacity: Any) -> Any:
 @kernel
 def _nearest_first(depths: Array) -> Any:
     """Return the stable order of positive depths, nearest first."""
-    # Digits of 12 bits, the last first; every round is stable, so earlier rounds stay sorted within it.
+    # Digits of 12 bits, the last first; every round is stable, so earlier rounds stay sorted within
+    # it.
     keys, mask, shift = depths.view(np.uint32).copy(), (1 << _BITS) - 1, 0
     order = np.arange(len(keys)).astype(np.int32)
     if len(keys):
@@ -79,7 +80,8 @@ def _measure(
 ) -> None:  # fmt: skip
     """Collect what `_find_spans` needs of every ellipse, and count its rows of tiles.
 
-    An ellipse's values are adjacent: taken nearest first, ellipses are scattered over memory; cache misses dominate.
+    An ellipse's values are adjacent: taken nearest first, ellipses are scattered over memory; cache
+    misses dominate.
     """
     size = f4(height)
     for i in range(first, last):
@@ -165,8 +167,9 @@ def bin_gaussians(projected: Projected, width: int, height: int) -> TileLists:
     strips = _ends(of_rows[order])
     spans = np.empty((strips[-1], 2), np.int32)
     in_threads(_find_spans, count, order, ellipses, width, height, strips, spans, entries, least=4096)
-    # Twice over the same lists: once to count the entries of every tile, once to fill them in. The parts of the depth
-    # order have places of their own within a tile, so they may be filled in parallel.
+    # Twice over the same lists: once to count the entries of every tile, once to fill them in. The
+    # parts of the depth order have places of their own within a tile, so they may be filled in
+    # parallel.
     offsets, of_parts, nothing = _ends(entries), np.zeros((_PARTS, tiles), np.int64), np.empty(0, np.int32)
     least = -(-_PARTS * 4096 // max(1, count))  # parts that are worth a thread
     in_threads(_walk, _PARTS, order, strips, spans, offsets, of_parts, nothing, nothing, least=least)

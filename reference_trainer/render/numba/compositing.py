@@ -4,9 +4,10 @@ A pixel sees ``C = sum_i T_i a_i c_i + T_end b``: colors c, alphas a, background
 transmittances ``T_i = prod_{j<i} (1 - a_j)``. Its transmittance is kept as a negative number from
 the splat on that terminates it (`MIN_TRANSMITTANCE`).
 
-The backward pass needs, for every splat, ``dC / da_i = T_i c_i - B_i / (1 - a_i)``, where B_i is the light from behind
-it, background included, which the splat dims by 1 - a_i. It goes front to back as well: B_i is the image less the light
-of all splats that have been passed, so nothing is stored per splat, and every alpha is evaluated once.
+The backward pass needs, for every splat, ``dC / da_i = T_i c_i - B_i / (1 - a_i)``, where B_i is
+the light from behind it, background included, which the splat dims by 1 - a_i. It goes front to
+back as well: B_i is the image less the light of all splats that have been passed, so nothing is
+stored per splat, and every alpha is evaluated once.
 """
 
 from __future__ import annotations
@@ -174,8 +175,9 @@ def _make_backward(depth: bool, absolute: bool) -> Any:
             tiles.load(to_image, tile, columns, s, _RED)
             tiles.load(transmittance, tile, columns, d, _TRANSMITTANCE)
             tiles.load(image, tile, columns, d, _RED)
-            # Only what the loss sees of the light matters: B_i enters as the number g . B_i, with g the gradient of the
-            # pixel. In front of everything it is g . C + (dL / dT_end) T_end, as T_end too shrinks by 1 - a_i.
+            # Only what the loss sees of the light matters: B_i enters as the number g . B_i, with g
+            # the gradient of the pixel. In front of everything it is g . C + (dL / dT_end) T_end,
+            # as T_end too shrinks by 1 - a_i.
             for p in range(PIXELS):
                 of_colors = s[_RED + p] * d[_RED + p] + s[_GREEN + p] * d[_GREEN + p] + s[_BLUE + p] * d[_BLUE + p]
                 s[_BEHIND + p] = of_colors + s[_TRANSMITTANCE + p] * d[_TRANSMITTANCE + p]

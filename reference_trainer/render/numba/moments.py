@@ -107,8 +107,9 @@ def _make_backward(complete: bool) -> Any:
     ) -> None:  # fmt: skip
         """Sum up what is behind every splat, back to front; then carry gradients front to back.
 
-        Let G be the gradient of V, Q_i = G . d_i^2 that of the weight S_i spread_i, and u_i that of mu_i, the mean of
-        what splat i and all behind it show. Then, with S_i the product of all shrinks in front of i ("front"):
+        Let G be the gradient of V, Q_i = G . d_i^2 that of the weight S_i spread_i, and u_i that of
+        mu_i, the mean of what splat i and all behind it show. Then, with S_i the product of all
+        shrinks in front of i ("front"):
 
             dL / dspread_i = S_i Q_i + dL / dshrink_i          as shrink contains spread
             dL / dshrink_i = S_i hidden_i,   hidden_i = sum_{j>i} Q_j spread_j S_j / S_{i+1}
@@ -130,7 +131,8 @@ def _make_backward(complete: bool) -> Any:
             tiles.load(to_variance, tile, columns, s, _VARIANCE)
             tiles.load(to_alpha[:1], tile, columns, s, _TO_TRANSMITTANCE)
             begin = starts[tile]
-            # First pass, back to front: alpha, contrasts and hidden of every entry, kept for the second.
+            # First pass, back to front: alpha, contrasts and hidden of every entry, kept for the
+            # second.
             for k in range(starts[tile + 1] - begin - 1, -1, -1):
                 i = gaussians[begin + k]
                 if tiles.is_faint(table, i):

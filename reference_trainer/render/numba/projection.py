@@ -1,7 +1,8 @@
 """From 3D Gaussians to colored 2D ellipses, one Gaussian after the other, and back for gradients.
 
-The formulas are those of `render/torch/projection.py`, which PyTorch differentiates; here every derivative is written
-out, beside the formula that it belongs to. ``to_x`` is the gradient of the loss with respect to ``x`` throughout.
+The formulas are those of `render/torch/projection.py`, which PyTorch differentiates; here every
+derivative is written out, beside the formula that it belongs to. ``to_x`` is the gradient of the
+loss with respect to ``x`` throughout.
 """
 
 from __future__ import annotations
@@ -284,7 +285,8 @@ def _backward(
         to_z = to_depths[k] - (_dot(row_x, to_row_x) + _dot(row_y, to_row_y)) / z
         to_z -= (slope_x * to_slope_x + slope_y * to_slope_y) / z
         to_x, to_y = to_slope_x / z, to_slope_y / z
-        # The camera's frame is a rotation of the world's: the transposed matrix carries gradients back.
+        # The camera's frame is a rotation of the world's: the transposed matrix carries gradients
+        # back.
         for j in range(3):
             to_means[i, j] = view[0, j] * to_x + view[1, j] * to_y + view[2, j] * to_z
         if degree < 0:
@@ -297,7 +299,8 @@ def _backward(
         b = to_colors[k, 2] if colors[k, 2] > _ZERO else _ZERO
         (dx, dy, dz), inverse = _towards(means, i, position)
         basis(dx, dy, dz, degree, values)
-        # color_c = 1/2 + sum_j basis_j(direction) sh_jc: to the coefficients, and to the basis functions.
+        # color_c = 1/2 + sum_j basis_j(direction) sh_jc: to the coefficients, and to the basis
+        # functions.
         for j in range((degree + 1) * (degree + 1)):
             to_sh[i, j, 0], to_sh[i, j, 1], to_sh[i, j, 2] = values[j] * r, values[j] * g, values[j] * b
             values[j] = r * sh[i, j, 0] + g * sh[i, j, 1] + b * sh[i, j, 2]

@@ -42,7 +42,8 @@ _HALF = f4(0.5 * np.log2(np.e))  # exp(-x / 2) = 2^(-_HALF x)
 _FAINT = f4(np.log2(MIN_ALPHA))
 _ABSENT = f4(-1e4)  # binary logarithm of an opacity that is 0 everywhere
 
-# The polynomial of degree 5 that approximates 2^x on [-1/2, 1/2] with the least relative error (7.5e-8).
+# The polynomial of degree 5 that approximates 2^x on [-1/2, 1/2] with the least relative error
+# (7.5e-8).
 _P0, _P1, _P2 = f4(1.00000007165467), f4(0.69314696706436), f4(0.24022119723882)
 _P3, _P4, _P5 = f4(0.05550713274154), f4(0.00967554133273), f4(0.00132764717803)
 
@@ -89,7 +90,8 @@ def over_tiles(kernel: Any, lists: TileLists, *arguments: Tensor) -> None:
 def sum_rows(rows: Tensor, table: Tensor, lists: TileLists) -> list[Tensor]:
     """Add up the rows of every splat's entries, (P, 9 or more), always in the same order.
 
-    Returns the gradients of means, factors, opacities and colors, and the sums of the remaining columns.
+    Returns the gradients of means, factors, opacities and colors, and the sums of the remaining
+    columns.
     """
     assert lists.offsets is not None
     sums = [table.new_empty(len(table), *shape) for shape in ((2,), (3,), (), (3,), (rows.shape[1] - 9,))]
@@ -191,10 +193,11 @@ def footprint(table: Any, i: Any, tile: Any, columns: Any) -> Any:
 
     It is log2 o - _HALF |factor (pixel - mean)|^2.
     """
-    # With (x, y) from the tile's center to a pixel and (dx, dy) to the mean, the components of factor (pixel - mean)
-    # are  e1 = l11 x + l21 y - w1  and  e2 = l22 y - w2,  where  w1 = l11 dx + l21 dy  and  w2 = l22 dy.
-    # Expanding -_HALF (e1^2 + e2^2) gives six coefficients. Squaring w1 and w2, which are small wherever alpha is not,
-    # avoids the cancellation of a dx^2 + 2 b dx dy + c dy^2.
+    # With (x, y) from the tile's center to a pixel and (dx, dy) to the mean, the two components of
+    # factor (pixel - mean) are  e1 = l11 x + l21 y - w1  and  e2 = l22 y - w2,  where w1 = l11 dx +
+    # l21 dy  and  w2 = l22 dy.  Expanding -_HALF (e1^2 + e2^2) gives six coefficients. Squaring w1
+    # and w2, which are small wherever alpha is not, avoids the cancellation of a dx^2 + 2 b dx dy +
+    # c dy^2.
     l11, l21, l22, _, _, w1, w2 = _from_center(table, i, tile, columns)
     return (
         table[i, 5] - _HALF * (w1 * w1 + w2 * w2),

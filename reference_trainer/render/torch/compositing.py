@@ -46,7 +46,8 @@ class Block(NamedTuple):
     Args:
         tiles: tile indices, row by row over the image, shape (T,).
         centers: of the tiles, pixels, shape (2, T, 1).
-        gaussians: the Gaussian of every entry, nearest first, shape (T, L); M, the number of Gaussians, marks padding.
+        gaussians: the Gaussian of every entry, nearest first, shape (T, L); M, the number of
+            Gaussians, marks padding.
     """
 
     tiles: Tensor
@@ -60,14 +61,16 @@ class Block(NamedTuple):
         """
         x, y, l11, l21, l22, log_opacity = geometry.unbind(0)
         dx, dy = x - self.centers[0], y - self.centers[1]
-        # log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2, expanded around the tile's center. Squaring w1 and w2,
-        # which are small wherever alpha is not, avoids the cancellation of a dx^2 + 2 b dx dy + c dy^2.
+        # log2 alpha = log2 o - _HALF |factor (pixel - mean)|^2, expanded around the tile's center.
+        # Squaring w1 and w2, which are small wherever alpha is not, avoids the cancellation of
+        # a dx^2 + 2 b dx dy + c dy^2.
         w1, w2 = l11 * dx + l21 * dy, l22 * dy
         polynomial = [
             log_opacity - _HALF * (w1 * w1 + w2 * w2), 2 * _HALF * (l11 * w1), 2 * _HALF * (l21 * w1 + l22 * w2),
             -_HALF * (l11 * l11), -2 * _HALF * (l11 * l21), -_HALF * (l21 * l21 + l22 * l22),
         ]  # fmt: skip
-        # The monomials at 64 pixels times the coefficients of L entries: one matrix product per block.
+        # The monomials at 64 pixels times the coefficients of L entries: one matrix product per
+        # block.
         x, y = pixel_offsets(geometry)
         exponents = torch.cat([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=1) @ torch.stack(polynomial, dim=1)
         return torch.nn.functional.threshold(exponents, math.log2(MIN_ALPHA), -math.inf).exp2()
@@ -118,8 +121,9 @@ def walk(formula: Formula, rows: Tensor, background: Tensor, lists: TileLists, *
     """Evaluate a formula on every tile's list over a background; differentiable in both.
 
     Args:
-        formula: takes a block, the rows of its entries (R, T, L) and the background of its tiles (T, C, 64); returns
-            (T, C + extra, 64), which without any splats is the background, followed by zeros.
+        formula: takes a block, the rows of its entries (R, T, L) and the background of its tiles
+            (T, C, 64); returns (T, C + extra, 64), which without any splats is the background,
+            followed by zeros.
         rows: values of every splat, the first six those of `geometry_rows`, shape (R, M).
         background: images, shape (C, H, W).
         lists: the splats of every tile.
@@ -156,7 +160,8 @@ class _Walk(torch.autograd.Function):
             with torch.enable_grad(), torch.autocast(rows.device.type, enabled=False):
                 result = ctx.formula(block, *inputs)
                 of_block, of_tiles = torch.autograd.grad(result, inputs, upstream[block.tiles], materialize_grads=True)
-            # A Gaussian is in the lists of many tiles; padding goes to the row that is cut off below.
+            # A Gaussian is in the lists of many tiles; padding goes to the row that is cut off
+            # below.
             to_entries.index_add_(1, block.gaussians.flatten(), of_block.flatten(1))
             to_tiles[block.tiles] = of_tiles
         return None, to_entries[:, :-1], untile(to_tiles, lists), None, None
@@ -221,9 +226,10 @@ class _BlendWeights(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
         passed, transmittance, weights = ctx.saved_tensors
-        # dw_i / dalpha_i = T_i, and for j > i  dw_j / dalpha_i = -w_j / (1 - alpha_i): a splat adds its own light, and
-        # scales all light from behind by 1 - alpha. With gradients g_j of the weights, sum_{j>i} w_j g_j is the total
-        # less what has been passed. Gradients pass the clamp.
+        # dw_i / dalpha_i = T_i, and for j > i  dw_j / dalpha_i = -w_j / (1 - alpha_i): a splat adds
+        # its own light, and scales all light from behind by 1 - alpha. With gradients g_j of the
+        # weights, sum_{j>i} w_j g_j is the total less what has been passed. Gradients pass the
+        # clamp.
         along = _running(weights * gradients[0], product=False)
         result: Tensor = transmittance * gradients[0] - (along[..., -1:] - along) / passed
         return result
@@ -259,9 +265,10 @@ def over(weights: Tensor, values: Tensor, background: Tensor) -> Tensor:
 def moments(block: Block, rows: Tensor, background: Tensor) -> Tensor:
     """Return mean and variance of C values, and the expected alpha, (T, 2 C + 1, 64).
 
-    The recursion of `ca_reg.functional.pixel_moments`, back to front: with d the contrast of a splat with the mean of
-    what is behind it, the mean grows by m alpha d, and the variance V becomes ((1 - m alpha)^2 + v alpha^2) V +
-    v alpha^2 d^2. Every term is a square times a non-negative weight: nothing cancels.
+    The recursion of `ca_reg.functional.pixel_moments`, back to front: with d the contrast of a
+    splat with the mean of what is behind it, the mean grows by m alpha d, and the variance V
+    becomes ((1 - m alpha)^2 + v alpha^2) V + v alpha^2 d^2. Every term is a square times a
+    non-negative weight: nothing cancels.
 
     The rows (9 + C, T, L) are the entries' geometry, mean m and variance v of the random factor, a
     factor on the summand v alpha^2 d^2, whose gradient is the summand's share, and values.

@@ -131,9 +131,10 @@ class TorchEngine:
             with torch.enable_grad():
                 image = compositing.over(compositing.blend_weights(raw), entries[6:], rows.new_zeros(()))
             (to_raw,) = torch.autograd.grad(image, raw, upstream[block.tiles])
-            # ln alpha = ln o - |(l11 dx + l21 dy, l22 dy)|^2 / 2 with (dx, dy) from the mean to the pixel:
-            # d ln alpha / dx_mean = l11 w1 and d ln alpha / dy_mean = l21 w1 + l22 w2. The gradient of alpha is alpha
-            # times that of its logarithm. Absolute values before the sum over pixels.
+            # ln alpha = ln o - |(l11 dx + l21 dy, l22 dy)|^2 / 2 with (dx, dy) from the mean to the
+            # pixel: d ln alpha / dx_mean = l11 w1 and d ln alpha / dy_mean = l21 w1 + l22 w2. The
+            # gradient of alpha is alpha times that of its logarithm. Absolute values before the sum
+            # over pixels.
             x, y, l11, l21, l22 = entries[:5, :, None]
             dx, dy = pixels[0] + block.centers[0][..., None] - x, pixels[1] + block.centers[1][..., None] - y
             w1, w2 = l11 * dx + l21 * dy, l22 * dy

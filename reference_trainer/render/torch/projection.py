@@ -27,7 +27,8 @@ def project(
 ) -> Projection:
     """Project 3D Gaussians with a local affine approximation of the perspective (EWA splatting).
 
-    Convention: OpenCV camera, half-pixel centers, wxyz quaternions. Every Gaussian must lie in front of the camera.
+    Convention: OpenCV camera, half-pixel centers, wxyz quaternions. Every Gaussian must lie in
+    front of the camera.
 
     The arguments are those of `reference_trainer.render.render`; differentiable in each.
 
@@ -43,7 +44,8 @@ def project(
     slope_x, slope_y = x / z, y / z
     limit_x, limit_y = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx, FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
     right, down, forward = (axis[:, None] for axis in rotation)
-    # The two rows of (Jacobian x view rotation), then of (Jacobian x view rotation x Gaussian axes), each (3, M).
+    # The two rows of (Jacobian x view rotation), then of (Jacobian x view rotation x Gaussian
+    # axes), each (3, M).
     row_x = (camera.fx / z) * (right - slope_x.clamp(-limit_x, limit_x) * forward)
     row_y = (camera.fy / z) * (down - slope_y.clamp(-limit_y, limit_y) * forward)
     axes = rotations(quaternions) * scales.T
@@ -66,7 +68,8 @@ def project(
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Evaluate the (degree + 1)^2 real spherical harmonics, up to 3, of unit vectors (N, 3).
 
-    Convention: the Condon-Shortley phase is kept and the order within a band is m = -l .. l, as in the INRIA code.
+    Convention: the Condon-Shortley phase is kept and the order within a band is m = -l .. l, as in
+    the INRIA code.
 
     Example:
         >>> sh_basis(torch.tensor([[0.0, 0.0, 1.0]]), 1).shape
@@ -95,7 +98,8 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 def evaluate_sh(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor:
     """Evaluate colors from spherical-harmonic coefficients.
 
-    Convention: 0.5 is added and the result is clamped below at 0, as in the INRIA code; it is not clamped above.
+    Convention: 0.5 is added and the result is clamped below at 0, as in the INRIA code; it is not
+    clamped above.
 
     The coefficients are (N, (degree + 1)^2, 3), of degree at most 3, the directions unit vectors
     from the camera center to the Gaussians, (N, 3), the colors (N, 3).
@@ -107,8 +111,9 @@ def evaluate_sh(coefficients: Tensor, directions: Tensor, degree: int) -> Tensor
     if degree == 0:
         return torch.relu(_A * coefficients[:, 0] + 0.5)
     count = coefficients.shape[1]
-    # Repeating the basis per channel and summing over it as matrix products keeps all axes long: on a CPU this is
-    # several times faster than a batched product or a broadcast over the three channels.
+    # Repeating the basis per channel and summing over it as matrix products keeps all axes long: on
+    # a CPU this is several times faster than a batched product or a broadcast over the three
+    # channels.
     channels = torch.eye(3, dtype=coefficients.dtype, device=coefficients.device)
     spread = torch.eye(count, dtype=coefficients.dtype, device=coefficients.device).repeat_interleave(3, dim=1)
     terms = (sh_basis(directions, degree) @ spread) * coefficients.flatten(1)
