@@ -215,6 +215,13 @@ def test_it_is_the_formula(take_step):
     assert SmoothDepth(0.3)(step).item() == pytest.approx(expected, rel=1e-9)
 
 
+def test_an_analytic_step_renders_the_depth_of_the_plain_model(take_step):
+    step = take_step()
+    expected = SmoothDepth(0.3)(step)
+    step.rendering = None  # as `Step.expect` leaves it
+    torch.testing.assert_close(SmoothDepth(0.3)(step), expected)
+
+
 def test_nothing_rendered_is_no_error(take_step):
     step = take_step(opacity_logits=torch.full((6,), -30.0, dtype=torch.float64, requires_grad=True))
     assert SmoothDepth()(step).item() == 0
