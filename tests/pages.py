@@ -1,4 +1,4 @@
-"""What the tests of the README and of the pages in docs read from Markdown."""
+"""What the tests of the README and of the pages in docs and benchmarks read from Markdown."""
 
 import re
 from pathlib import Path
@@ -16,7 +16,19 @@ def blocks(page: Path, language: str) -> list[str]:
     return [text for found, text in fenced_blocks(page) if found == language]
 
 
-def linked_files(page: Path) -> dict[str, Path]:
-    """Return the relative links of a page, without their anchors, and where they lead."""
-    links = re.findall(r"(?:\]\(|^\[[\w-]+\]: )([^)#\s]+)", page.read_text(encoding="utf-8"), re.MULTILINE)
-    return {link: page.parent / link for link in links if not re.match(r"\w+:", link)}
+def broken_links(page: Path) -> list[str]:
+    """Return the relative links of a page whose file, or whose heading in it, does not exist."""
+    links = re.findall(r"(?:\]\(|^\[[\w-]+\]: )([^)\s]+)", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return [link for link in links if not re.match(r"\w+:", link) and not _leads_somewhere(page, link)]
+
+
+def _leads_somewhere(page: Path, link: str) -> bool:
+    name, _, anchor = link.partition("#")
+    file = page.parent / name if name else page
+    return file.exists() and (file.suffix != ".md" or not anchor or anchor in _anchors(file))
+
+
+def _anchors(page: Path) -> set[str]:
+    """Return the anchors of a page, as GitHub and MkDocs make them."""
+    titles = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
