@@ -271,7 +271,7 @@ def one_exposure(scene: Scene, config: TrainConfig) -> PlanItem:
     """Photographs made equally bright. It is decided when the scene is loaded: the plan can only tell of them."""
     name = "one exposure"
     if any(view.exposure is not None for view in scene.train):
-        return PlanItem(name, "used", "asked for, and photographs differ")
+        return PlanItem(name, "used", "one photograph is brighter than another, which the run undoes")
     if len(scene.train) > FEW:  # the time goes by the pairs
         return PlanItem(name, "left out", f"not looked for among more than {FEW} photographs")
     factors = exposures(scene.train, scene.points.positions)
