@@ -61,6 +61,7 @@ class Choice:
         starts: whether the names are of points.
         begun: names a scene with the start of all.
         over: the recipe.
+        even: whether photographs are made equally bright, in both arms.
     """
 
     names: tuple[str, ...]
@@ -70,6 +71,7 @@ class Choice:
     starts: bool = False
     begun: Callable[[str], str] = from_dense
     over: str = LATER
+    even: bool = False
 
 
 _HIDDEN = "warp + hidden left out"
@@ -85,6 +87,7 @@ _OVER_MEAN = (MEAN_BACKGROUND, f"random background + {MEAN_BACKGROUND}")
 _BEGINNINGS = ("opaque", "small", "opaque + small", "large")
 _WITHOUT = "without dropout", "without decay"
 _SMOOTH = "smooth 0.1", "smooth 0.5", ELSEWHERE
+_BESIDE = "early", "planes", "absgrad", "D-SSIM 0.4", f"{_HIDDEN} + no smoothness"
 _COUNTS = ("5,000 dense and few", "8,000 dense and few", "30,000 dense and few", "filled")
 CHOICES = {
     "third": Choice(("rate 0.3", "no reset", "threshold 3e-4"), seeds=(0,)),
@@ -115,6 +118,8 @@ CHOICES = {
     "twenty-sixth": Choice(_SMOOTH, seeds=(0,), begun=from_today, over=ANY_COLOR),
     "twenty-sixth, by shared pixels": Choice(_SMOOTH, range(3), (0, 1, 2), "shared", begun=from_today, over=ANY_COLOR),
     "twenty-seventh": Choice((ONE_EXPOSURE,), range(6), tuple(range(6)), "shared", begun=from_today, over=TODAY),
+    "twenty-eighth": Choice(_BESIDE, range(6), (0,), "shared", begun=from_today, over=TODAY, even=True),
+    "twenty-eighth, two seeds": Choice(_BESIDE, range(6), (0, 1), "shared", begun=from_today, over=TODAY, even=True),
 }
 SLOWER_MEANS = {LATER: "recipe", f"{LATER} + means x1/4": "means x1/4"}
 """The judgement of the sixth choice, for `from_same_start`."""
@@ -233,9 +238,10 @@ def gains_of(rows: Sequence[Row], choice: Choice) -> str:
         line, gains = {"candidate": name}, list[tuple[float, float]]()
         for scene in HELD_OUT:
             start = choice.begun(scene)
-            over = _on(scene, choice.over)
-            own = (f"{scene}, {name}", over) if choice.starts else (start, f"{over} + {name}")
-            recipe, found = rows_of(rows, start, over), rows_of(rows, *own)
+            end = f" + {ONE_EXPOSURE}" * choice.even
+            over, own = _on(scene, choice.over + end), _on(scene, f"{choice.over} + {name}{end}")
+            recipe = rows_of(rows, start, over)
+            found = rows_of(rows, f"{scene}, {name}", over) if choice.starts else rows_of(rows, start, own)
             before, after = (
                 [(of[s][figure], value(of[s], "test psnr"), of[s]["gaussians"]) for s in who if figure in of.get(s, ())]
                 for of, who in ((recipe, choice.seeds), (found, choice.tried))
