@@ -45,7 +45,7 @@ __all__ = [
     "BY_TODAYS", "CHOICES", "DROPOUT_ALONE",
     "ENSEMBLE", "EVEN", "EVEN_OVER_PLAIN", "KINDS", "LEFT_OUT", "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER",
     "SLOWER_MEANS", "SMOOTH", "SMOOTH_AND_EVEN", "TODAYS_BESIDE_BINOCULAR", "UNEVEN", "WITHOUT",
-    "Choice", "figures_of", "from_same_start", "gains_of", "pairs_of", "tables",
+    "Choice", "figures_of", "from_same_start", "gains_of", "name_on", "pairs_of", "tables",
 ]  # fmt: skip
 
 
@@ -239,7 +239,7 @@ def gains_of(rows: Sequence[Row], choice: Choice) -> str:
         for scene in HELD_OUT:
             start = choice.begun(scene)
             end = f" + {ONE_EXPOSURE}" * choice.even
-            over, own = _on(scene, choice.over + end), _on(scene, f"{choice.over} + {name}{end}")
+            over, own = name_on(scene, choice.over + end), name_on(scene, f"{choice.over} + {name}{end}")
             recipe = rows_of(rows, start, over)
             found = rows_of(rows, f"{scene}, {name}", over) if choice.starts else rows_of(rows, start, own)
             before, after = (
@@ -257,7 +257,7 @@ def gains_of(rows: Sequence[Row], choice: Choice) -> str:
     return markdown_table([dict.fromkeys(columns, "-") | line for line in lines], columns)
 
 
-def _on(scene: str, name: str) -> str:
+def name_on(scene: str, name: str) -> str:
     """Return the name of a setting's rows of a scene: some make no difference there.
 
     Where photographs show the background, it stays, and where they do not differ in exposure, they do.
@@ -271,7 +271,7 @@ def _rows(rows: Sequence[Row], scene: str, name: str, begun: Callable[[str], str
     if scene == "synthetic" and name == "plain":  # those of the paper's grid
         return references_of(rows, REFERENCES, scene)[name]
     start = scene if scene == "synthetic" else begun(scene)  # it has points of its own
-    return rows_of(rows, start, _on(scene, name))
+    return rows_of(rows, start, name_on(scene, name))
 
 
 def pairs_of(
@@ -283,7 +283,7 @@ def pairs_of(
     """
     found: dict[str, list[tuple[float, float]]] = {}
     for scene in SCENES:
-        if len({_on(scene, name) for name in names}) == 1:
+        if len({name_on(scene, name) for name in names}) == 1:
             continue
         before, after = (_rows(rows, scene, name, begun) for name in names)
         if shared := sorted(before.keys() & after.keys()):

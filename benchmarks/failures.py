@@ -15,6 +15,7 @@ from statistics import fmean, median
 import numpy as np
 from scipy.stats import binomtest, spearmanr
 
+from benchmarks.choices import name_on
 from benchmarks.paper.rows import value
 from benchmarks.setting import (
     BINOCULAR,
@@ -22,13 +23,15 @@ from benchmarks.setting import (
     DENSE,
     FEWEST,
     LATER,
+    ONE_EXPOSURE,
     REFERENCES,
     RELATIVE,
+    TODAY,
     Row,
     references_of,
     rows_of,
 )
-from benchmarks.start_scenes import from_dense
+from benchmarks.start_scenes import from_dense, from_today
 from reference_trainer.evaluation.tables import markdown_table, mean_std
 
 __all__ = ["FAILING", "failures", "foreseen", "predicted"]
@@ -42,6 +45,9 @@ FROM_DENSE = {LATER: DENSE, "plain": PLAIN_DENSE} | {
     for name in ("dropout", "noise", "expectation", f"{BINOCULAR}{RELATIVE}")
 }
 """The settings of the study from the start that a user has, by the names of their rows."""
+PLAIN_TODAY = "plain, today's start"
+FROM_TODAY = {f"{TODAY} + {ONE_EXPOSURE}": "as `ca-reg run` trains", "plain": PLAIN_TODAY}
+"""The same as a user has it today."""
 FAILING = ("herz-jesu", "fountain", "dtu-scan65", "sceaux")
 """The scenes of the study."""
 PREDICTED = (13, 14, 15)
@@ -52,8 +58,9 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
     """Return the table of the seeds: median, spread and the worst by scene and setting, and how often one fails."""
     lines, counts, ahead = [], dict[str, list[bool]](), dict[str, list[float]]()
     for scene in FAILING:
-        dense = from_dense(scene)
-        every = {label: rows_of(rows, dense, name) for name, label in FROM_DENSE.items()}
+        dense, today = from_dense(scene), from_today(scene)
+        every = {label: rows_of(rows, today, name_on(scene, name)) for name, label in FROM_TODAY.items()}
+        every |= {label: rows_of(rows, dense, name) for name, label in FROM_DENSE.items()}
         every |= {name: rows_of(rows, scene, name) for name in (LATER, CHOSEN)}
         every |= references_of(rows, references, scene)
         figures = {
@@ -70,7 +77,8 @@ def failures(rows: Sequence[Row], references: Path = REFERENCES) -> str:
                 "standard deviation": f"{mean_std(of.values())[1]:.2f}", "worst": f"{worst:.2f}",
                 "to the median": f"{worst - middle:+.2f}", "failures": str(sum(failed)),
             })  # fmt: skip
-        pairs = [(label, PLAIN_DENSE) for label in FROM_DENSE.values() if label != PLAIN_DENSE]
+        begun = (FROM_TODAY, PLAIN_TODAY), (FROM_DENSE, PLAIN_DENSE)
+        pairs = [(label, plain) for labels, plain in begun for label in labels.values() if label != plain]
         for name, other in (*pairs, (LATER, "plain"), (CHOSEN, "plain")):
             own, plain = (figures.get(x, {}) for x in (name, other))
             ahead.setdefault(name, []).extend(own[seed] - plain[seed] for seed in own.keys() & plain.keys())
