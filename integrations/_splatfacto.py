@@ -10,6 +10,7 @@ from types import ModuleType
 from typing import Any
 
 import torch
+from kornia.losses import inverse_depth_smoothness_loss
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
@@ -49,6 +50,7 @@ class CoAdaptation(_Splatfacto):  # type: ignore[misc]
     def populate_modules(self) -> None:
         """Create the parts of the model, its regularizers and its score."""
         super().populate_modules()
+        self.config.output_depth_during_training |= self.config.smooth_depth > 0
         if not isinstance(self.holder.rasterization, _Dispatch):
             self.holder.rasterization = _Dispatch(self.holder.rasterization)  # type: ignore[attr-defined]
         self._original: Rasterization = self.holder.rasterization.original
@@ -77,6 +79,20 @@ class CoAdaptation(_Splatfacto):  # type: ignore[misc]
         if not self.training and self.crop_box is None and "rgb" in outputs:
             self._cameras[outputs["rgb"]] = camera
         return outputs
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Tensor] | None = None
+    ) -> dict[str, Tensor]:
+        """Return the losses of splatfacto and, in training, smooth depth, once density control has begun."""
+        losses: dict[str, Tensor] = super().get_loss_dict(outputs, batch, metrics_dict)
+        if self.training and self.config.smooth_depth > 0 and self.step >= self.config.warmup_length:
+            photograph = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+            # Where nothing is rendered, splatfacto's depth is the largest of the picture; here it is infinite.
+            inverse = (outputs["accumulation"] > 0) / outputs["depth"].clamp_min(1e-8)
+            inverse = inverse / inverse.mean().clamp_min(1e-12)
+            smoothness = inverse_depth_smoothness_loss(*(x.permute(2, 0, 1)[None] for x in (inverse, photograph)))
+            losses["smooth_depth"] = self.config.smooth_depth * smoothness
+        return losses
 
     def decay_opacities(self, step: int) -> None:
         """Decay the opacities after a training step, counted from 0, once density control has begun."""

@@ -28,6 +28,8 @@ class SplatfactoCAModelConfig(SplatfactoModelConfig):  # type: ignore[misc]
     """standard deviation of the relative noise on the opacities in training; the paper uses 0.8"""
     opacity_decay: float = 1.0
     """factor on all opacities after each step, from warmup_length on, such as 0.995; 1 leaves them as they are"""
+    smooth_depth: float = 0.0
+    """weight of kornia's inverse_depth_smoothness_loss in training, from warmup_length on, such as 0.1"""
     regularizer: str = ""
     """instead of these two, such as "dropout(0.2) + noise(0.8, scale=True)" or my_module:MyDropout; scored at p = 0"""
     ca_samples: int = 5
