@@ -194,6 +194,7 @@ EVALUATE = (
 )
 OPTIONS = {
     "plain": "", "dropout": "--dropout 0.2", "noise": "--noise 0.8", "decay": "--dropout 0.2 --opacity-decay 0.995",
+    "smooth": "--dropout 0.2 --opacity-decay 0.995 --smooth-depth 0.1",
 }  # fmt: skip
 AS_IT_IS = "3DGS as it is"
 """3DGS with all settings of its own but for the number of iterations, over which positions slow down."""
@@ -216,7 +217,7 @@ def settings(trainer: str) -> Sequence[str]:
     if ": " in trainer:
         return ["plain"]
     if trainer in TO_THE_END:
-        return ["plain", "dropout", "decay"]
+        return ["plain", "dropout", "decay", *["smooth"] * (trainer == SPLATFACTO_TO_THE_END)]
     if trainer == "DropGaussian":  # which refuses a second dropout
         return ["plain", "noise"]
     return ["plain", "dropout", "noise"]

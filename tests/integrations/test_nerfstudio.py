@@ -48,6 +48,15 @@ class Splatfacto(nn.Module):
         )
         return {"rgb": image.squeeze(0), "accumulation": alpha.squeeze(0)}
 
+    def get_loss_dict(self, outputs, batch, metrics_dict=None):
+        return {"main_loss": torch.zeros(())}
+
+    def get_gt_img(self, image):
+        return image
+
+    def composite_with_background(self, image, background):
+        return image
+
     def update_to_step(self, step):
         pass
 
@@ -58,7 +67,7 @@ class Splatfacto(nn.Module):
 CAMERA = torch.eye(4)[None]
 CONFIG = {
     "dropout": 0.4, "opacity_noise": 0.0, "opacity_decay": 1.0, "warmup_length": 500, "regularizer": "",
-    "ca_samples": 5,
+    "ca_samples": 5, "smooth_depth": 0.0, "output_depth_during_training": False,
 }  # fmt: skip
 
 
@@ -118,6 +127,22 @@ def test_opacities_decay_from_the_step_on_at_which_density_control_begins():
     for step in range(5):  # nerfstudio's first step is 0: three before density control, two after
         model.decay_opacities(step)
     torch.testing.assert_close(activated(model), before * 0.9**2)
+
+
+def test_smooth_depth_is_the_slope_of_the_inverse_depth_over_its_mean():
+    """In training, once density control has begun; before one color, where no edge of the photograph allows a jump."""
+    model, _ = make(smooth_depth=0.1, warmup_length=3)
+    assert model.config.output_depth_during_training
+    inverse = torch.arange(4.0).expand(2, 4)[..., None]  # 0, where nothing is rendered, to 3
+    depth = torch.where(inverse > 0, 1 / inverse, 1.0)
+    outputs = {"depth": depth, "accumulation": (inverse > 0) * 0.7, "background": None}
+    batch = {"image": torch.full((2, 4, 3), 0.5)}
+    losses = []
+    for model.step in range(5):
+        losses.append(model.get_loss_dict(outputs, batch))
+    assert ["smooth_depth" in of for of in losses] == [False, False, False, True, True]
+    assert losses[-1]["smooth_depth"].item() == pytest.approx(0.1 * 1.0 / 1.5)
+    assert set(model.eval().get_loss_dict(outputs, batch)) == {"main_loss"}
 
 
 def test_the_launchers_regularizer_beside_its_own_is_refused():

@@ -112,6 +112,19 @@ def test_the_real_model_densifies_and_is_scored(splatfacto):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
+def test_the_real_models_depth_is_smoothed(splatfacto):
+    model, optimizers, camera = make_real(splatfacto, nerfstudio.SplatfactoCAModelConfig(smooth_depth=1.0))
+    batch = {"image": torch.full((24, 32, 3), 0.5), "image_idx": 0}
+    for model.step, named in ((0, False), (model.config.warmup_length, True)):
+        losses = model.get_loss_dict(model.get_outputs(camera), batch)
+        assert ("smooth_depth" in losses) == named
+    losses["smooth_depth"].backward()
+    assert 0 < losses["smooth_depth"] < 10
+    assert model.means.grad[:, 2].any()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
 def test_without_rates_the_real_model_is_splatfacto(splatfacto):
     runs = []
     for config in (nerfstudio.SplatfactoCAModelConfig(dropout=0.0, ca_samples=0), splatfacto.SplatfactoModelConfig()):
