@@ -76,7 +76,7 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "random background": ("random_background", "on"),
     "smooth 0.1": ("loss", "smooth_depth(between(0.1,"),
     "smooth 0.5": ("loss", "smooth_depth(between(0.5,"),
-    "early": ("loss", "smooth_depth(0.1)"),
+    "early": ("loss", "smooth_depth(between(0.1,0))"),
     "warp": ("loss", "warp("),
     "hidden left out": ("loss", "hidden="),
     "every second step": ("loss", "every=2"),
