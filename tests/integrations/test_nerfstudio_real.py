@@ -115,7 +115,8 @@ def test_the_real_model_densifies_and_is_scored(splatfacto):
 def test_the_real_models_depth_is_smoothed(splatfacto):
     model, optimizers, camera = make_real(splatfacto, nerfstudio.SplatfactoCAModelConfig(smooth_depth=1.0))
     batch = {"image": torch.full((24, 32, 3), 0.5), "image_idx": 0}
-    for model.step, named in ((0, False), (model.config.warmup_length, True)):
+    for step, named in ((0, False), (model.config.warmup_length, True)):
+        model.step_cb(optimizers, step)
         losses = model.get_loss_dict(model.get_outputs(camera), batch)
         assert ("smooth_depth" in losses) == named
     losses["smooth_depth"].backward()
