@@ -27,6 +27,7 @@ from benchmarks.setting import (
     MEAN_BACKGROUND,
     ONE_EXPOSURE,
     OTHER_KINDS,
+    PLANES,
     REFERENCES,
     RELATIVE,
     SHOWN,
@@ -87,7 +88,7 @@ _OVER_MEAN = (MEAN_BACKGROUND, f"random background + {MEAN_BACKGROUND}")
 _BEGINNINGS = ("opaque", "small", "opaque + small", "large")
 _WITHOUT = "without dropout", "without decay"
 _SMOOTH = "smooth 0.1", "smooth 0.5", ELSEWHERE
-_BESIDE = "early", "planes", "absgrad", "D-SSIM 0.4", f"{_HIDDEN} + no smoothness"
+_BESIDE = "early", PLANES, "absgrad", "D-SSIM 0.4", f"{_HIDDEN} + no smoothness"
 _COUNTS = ("5,000 dense and few", "8,000 dense and few", "30,000 dense and few", "filled")
 CHOICES = {
     "third": Choice(("rate 0.3", "no reset", "threshold 3e-4"), seeds=(0,)),
@@ -238,10 +239,9 @@ def gains_of(rows: Sequence[Row], choice: Choice) -> str:
         line, gains = {"candidate": name}, list[tuple[float, float]]()
         for scene in HELD_OUT:
             start = choice.begun(scene)
-            end = f" + {ONE_EXPOSURE}" * choice.even
-            over, own = name_on(scene, choice.over + end), name_on(scene, f"{choice.over} + {name}{end}")
-            recipe = rows_of(rows, start, over)
-            found = rows_of(rows, f"{scene}, {name}", over) if choice.starts else rows_of(rows, start, own)
+            over, end = name_on(scene, choice.over), f" + {ONE_EXPOSURE}" * (choice.even and scene in UNEVEN)
+            own = (f"{scene}, {name}", over) if choice.starts else (start, f"{over} + {name}{end}")
+            recipe, found = rows_of(rows, start, over + end), rows_of(rows, *own)
             before, after = (
                 [(of[s][figure], value(of[s], "test psnr"), of[s]["gaussians"]) for s in who if figure in of.get(s, ())]
                 for of, who in ((recipe, choice.seeds), (found, choice.tried))

@@ -119,8 +119,8 @@ DENSE = "from 1,000, dense start"
 """The same as a user has it, with the start that it has by default."""
 ONE_EXPOSURE = "one exposure"
 """What the tenth choice adds: photographs made equally bright, ``--one-exposure``."""
-MEAN_BACKGROUND, ELSEWHERE = "mean background", "smooth 0.5 elsewhere"
-"""What the eighteenth and the twenty-sixth choice tried; the code of neither was kept."""
+MEAN_BACKGROUND, ELSEWHERE, PLANES = "mean background", "smooth 0.5 elsewhere", "planes"
+"""What the eighteenth, the twenty-sixth and the twenty-eighth choice tried; their code was not kept."""
 DISTILLED = {1: "distilled, alone", 2: "distilled of two", 3: "distilled of three"}
 """What the eleventh choice adds, by the number of models."""
 TWICE, HALF, THIRD = "twice the steps", "half the steps", "a third of the steps"
@@ -470,7 +470,7 @@ def _is_second(candidate: str) -> bool:
     return (
         names <= _SECOND.keys()
         or "distilled" in candidate
-        or bool(names & {ONE_EXPOSURE, MEAN_BACKGROUND, ELSEWHERE, *_STEPS.values()})
+        or bool(names & {ONE_EXPOSURE, MEAN_BACKGROUND, ELSEWHERE, PLANES, *_STEPS.values()})
     )
 
 
