@@ -253,7 +253,7 @@ def _distilled(loss: str) -> str:
     """Return which models a loss distills: how many, or if they are of several kinds, which the others are."""
     members = _members(loss)
     first, *others = (candidate(dataclasses.replace(member, random_background="off")) for member in members)
-    kinds = [other.removeprefix(f"{LATER} + ") for other in others if other != first]
+    kinds = [other.removeprefix(f"{first} + ").removeprefix(f"{LATER} + ") for other in others if other != first]
     steps = [f", {part}" for part in first.split(" + ") if part in _STEPS.values()]
     return f"distilled with {', '.join(kinds)}" if kinds else "".join([DISTILLED[len(members)], *steps])
 
