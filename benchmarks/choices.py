@@ -45,7 +45,8 @@ __all__ = [
     "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_ANY_COLOR", "BY_DEFAULT", "BY_SMOOTH",
     "BY_TODAYS", "CHOICES", "DROPOUT_ALONE",
     "ENSEMBLE", "EVEN", "EVEN_OVER_PLAIN", "KINDS", "LEFT_OUT", "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER",
-    "SLOWER_MEANS", "SMOOTH", "SMOOTH_AND_EVEN", "TODAYS_BESIDE_BINOCULAR", "UNEVEN", "WITHOUT",
+    "SLOWER_MEANS", "SMOOTH", "SMOOTH_AND_EVEN", "TODAYS_BESIDE_BINOCULAR", "TWO_BESIDE_ONE", "TWO_BY_TODAYS",
+    "UNEVEN", "WITHOUT",
     "Choice", "figures_of", "from_same_start", "gains_of", "name_on", "pairs_of", "tables",
 ]  # fmt: skip
 
@@ -168,6 +169,11 @@ BY_TODAYS = {"plain": "plain", f"{TODAY} + {ONE_EXPOSURE}": "smooth 0.1, one exp
 """What both gain over plain trainings as they are: what `ca-reg run` does today."""
 BY_SMOOTH = {"plain": "plain", TODAY: "smooth 0.1"}
 """What the recipe gains alone."""
+_TWO_MODELS = f"{LATER} + smooth 0.1 + {_SHORTER[2]} + {ONE_EXPOSURE}"
+TWO_BY_TODAYS = {"plain": "plain", _TWO_MODELS: "two models"}
+"""What two models of the same make gain."""
+TWO_BESIDE_ONE = {f"{TODAY} + {ONE_EXPOSURE}": "one model", _TWO_MODELS: "two models"}
+"""The same beside the first of them alone."""
 TODAYS_BESIDE_BINOCULAR = {f"{BINOCULAR}{RELATIVE}": BINOCULAR, f"{TODAY} + {ONE_EXPOSURE}": "recipe, one exposure"}
 """The recipe beside it, from the start as it is now."""
 QUALITY = {
@@ -204,7 +210,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
     gained = [gains_of(rows, choice) for choice in CHOICES.values()]
     of_today = (
         BY_DEFAULT, BY_ANY_COLOR, TODAYS_BESIDE_BINOCULAR, *LEFT_OUT, *EVEN, EVEN_OVER_PLAIN, SMOOTH, SMOOTH_AND_EVEN,
-        BY_SMOOTH, BY_TODAYS,
+        BY_SMOOTH, BY_TODAYS, TWO_BY_TODAYS, TWO_BESIDE_ONE,
     )  # fmt: skip
     today = [from_same_start(rows, titles, from_today) for titles in of_today]
     without = figures_of(rows, WITHOUT, "{psnr:.2f}, {lpips:.3f}, {score:.2f}, {thousands:.0f}", (0,))
