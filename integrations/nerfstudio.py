@@ -1,9 +1,10 @@
 """`splatfacto-ca`, a method of nerfstudio: splatfacto with dropout, opacity noise and the co-adaptation score.
 
 Nothing has to be imported: where both packages are installed, ``ns-train splatfacto-ca --data ...`` trains it, with
-``--pipeline.model.dropout``, ``--pipeline.model.opacity-noise``, ``--pipeline.model.regularizer`` and
-``--pipeline.model.ca-samples`` besides the options of splatfacto. Evaluation images are logged with ``ca``,
-``ca_std_error`` and ``ca_visible``, the share of visible pixels; where that is 0, ``ca`` is nan.
+``--pipeline.model.dropout``, ``--pipeline.model.opacity-noise``, ``--pipeline.model.regularizer``,
+``--pipeline.model.opacity-decay``, ``--pipeline.model.smooth-depth`` and ``--pipeline.model.ca-samples`` besides the
+options of splatfacto. Evaluation images are logged with ``ca``, ``ca_std_error`` and ``ca_visible``, the share of
+visible pixels; where that is 0, ``ca`` is nan.
 
 The score is the paper's, keeping half as many Gaussians as training did, except that splatfacto clamps its colors.
 Exported PLY files hold the opacities as trained; viewers other than nerfstudio's have to scale them by 1 - dropout.
