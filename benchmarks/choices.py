@@ -45,8 +45,8 @@ __all__ = [
     "BESIDE_BINOCULAR", "BESIDE_DROPOUT", "BESIDE_TWO", "BY_ANY_COLOR", "BY_DEFAULT", "BY_SMOOTH",
     "BY_TODAYS", "CHOICES", "DROPOUT_ALONE",
     "ENSEMBLE", "EVEN", "EVEN_OVER_PLAIN", "KINDS", "LEFT_OUT", "PLAIN_ENSEMBLE", "QUALITY", "SHARPER", "SHORTER",
-    "SLOWER_MEANS", "SMOOTH", "SMOOTH_AND_EVEN", "TODAYS_BESIDE_BINOCULAR", "TWO_BESIDE_ONE", "TWO_BY_TODAYS",
-    "UNEVEN", "WITHOUT",
+    "SLOWER_MEANS", "SMOOTH", "SMOOTHLY", "SMOOTH_AND_EVEN", "TODAYS_BESIDE_BINOCULAR", "TWO_BESIDE_ONE",
+    "TWO_BY_TODAYS", "UNEVEN", "WITHOUT",
     "Choice", "figures_of", "from_same_start", "gains_of", "name_on", "pairs_of", "tables",
 ]  # fmt: skip
 
@@ -172,6 +172,8 @@ BY_SMOOTH = {"plain": "plain", TODAY: "smooth 0.1"}
 _TWO_MODELS = f"{LATER} + smooth 0.1 + {_SHORTER[2]} + {ONE_EXPOSURE}"
 TWO_BY_TODAYS = {"plain": "plain", _TWO_MODELS: "two models"}
 """What two models of the same make gain."""
+SMOOTHLY = {_TWO_MODELS: "two models", _TWO_MODELS.replace(HALF, f"{HALF}, smoothly"): "smoothly"}
+"""The judgement of the twenty-ninth choice."""
 TWO_BESIDE_ONE = {f"{TODAY} + {ONE_EXPOSURE}": "one model", _TWO_MODELS: "two models"}
 """The same beside the first of them alone."""
 TODAYS_BESIDE_BINOCULAR = {f"{BINOCULAR}{RELATIVE}": BINOCULAR, f"{TODAY} + {ONE_EXPOSURE}": "recipe, one exposure"}
@@ -210,7 +212,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
     gained = [gains_of(rows, choice) for choice in CHOICES.values()]
     of_today = (
         BY_DEFAULT, BY_ANY_COLOR, TODAYS_BESIDE_BINOCULAR, *LEFT_OUT, *EVEN, EVEN_OVER_PLAIN, SMOOTH, SMOOTH_AND_EVEN,
-        BY_SMOOTH, BY_TODAYS, TWO_BY_TODAYS, TWO_BESIDE_ONE,
+        BY_SMOOTH, BY_TODAYS, TWO_BY_TODAYS, TWO_BESIDE_ONE, SMOOTHLY,
     )  # fmt: skip
     today = [from_same_start(rows, titles, from_today) for titles in of_today]
     without = figures_of(rows, WITHOUT, "{psnr:.2f}, {lpips:.3f}, {score:.2f}, {thousands:.0f}", (0,))

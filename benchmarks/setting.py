@@ -225,7 +225,7 @@ def candidate(config: TrainConfig, options: SceneOptions | None = None) -> str:
     if "distillation(" in config.loss:
         smooth = " + smooth 0.1" * ("smooth_depth(" in _members(config.loss)[0].loss)
         learner = (LATER if config.random_background == "off" else ANY_COLOR) + smooth if config.dropout else "plain"
-        return f"{learner} + {_distilled(config.loss)}"
+        return f"{learner} + {_distilled(config.loss)}" + ", smoothly" * ("smooth_depth(" in config.loss)
     begins = 10 * round(300 * config.densify_from / config.iterations)  # of 3,000 steps
     if config.analytic:
         return "expectation" + (f", decay {config.opacity_decay}" if config.opacity_decay < 1 else "")
