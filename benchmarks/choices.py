@@ -169,7 +169,7 @@ BY_TODAYS = {"plain": "plain", f"{TODAY} + {ONE_EXPOSURE}": "smooth 0.1, one exp
 """What both gain over plain trainings as they are: what `ca-reg run` does today."""
 BY_SMOOTH = {"plain": "plain", TODAY: "smooth 0.1"}
 """What the recipe gains alone."""
-_TWO_MODELS = f"{LATER} + smooth 0.1 + {_SHORTER[2]} + {ONE_EXPOSURE}"
+_TWO_MODELS = f"{TODAY} + {_SHORTER[2]} + {ONE_EXPOSURE}"
 TWO_BY_TODAYS = {"plain": "plain", _TWO_MODELS: "two models"}
 """What two models of the same make gain."""
 SMOOTHLY = {_TWO_MODELS: "two models", _TWO_MODELS.replace(HALF, f"{HALF}, smoothly"): "smoothly"}
