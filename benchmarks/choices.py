@@ -172,10 +172,10 @@ BY_SMOOTH = {"plain": "plain", TODAY: "smooth 0.1"}
 _TWO_MODELS = f"{TODAY} + {_SHORTER[2]} + {ONE_EXPOSURE}"
 TWO_BY_TODAYS = {"plain": "plain", _TWO_MODELS: "two models"}
 """What two models of the same make gain."""
-SMOOTHLY = {_TWO_MODELS: "two models", _TWO_MODELS.replace(HALF, f"{HALF}, smoothly"): "smoothly"}
-"""The judgement of the twenty-ninth choice."""
 TWO_BESIDE_ONE = {f"{TODAY} + {ONE_EXPOSURE}": "one model", _TWO_MODELS: "two models"}
 """The same beside the first of them alone."""
+SMOOTHLY = {_TWO_MODELS: "two models", _TWO_MODELS.replace(HALF, f"{HALF}, smoothly"): "smoothly"}
+"""The judgement of the twenty-ninth choice."""
 TODAYS_BESIDE_BINOCULAR = {f"{BINOCULAR}{RELATIVE}": BINOCULAR, f"{TODAY} + {ONE_EXPOSURE}": "recipe, one exposure"}
 """The recipe beside it, from the start as it is now."""
 QUALITY = {

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from ca_reg import CAScore, Chain, GaussianDropout, OpacityNoise
+from ca_reg._check import check_finite
 from ca_reg.decay import OpacityDecay
 from ca_reg.regularizers import parse
 
@@ -50,6 +51,7 @@ class CoAdaptation(_Splatfacto):  # type: ignore[misc]
     def populate_modules(self) -> None:
         """Create the parts of the model, its regularizers and its score."""
         super().populate_modules()
+        check_finite(self.config.smooth_depth, "smooth_depth", minimum=0)
         self.config.output_depth_during_training |= self.config.smooth_depth > 0
         if not isinstance(self.holder.rasterization, _Dispatch):
             self.holder.rasterization = _Dispatch(self.holder.rasterization)  # type: ignore[attr-defined]

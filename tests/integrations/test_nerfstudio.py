@@ -143,6 +143,8 @@ def test_smooth_depth_is_the_slope_of_the_inverse_depth_over_its_mean():
     assert ["smooth_depth" in of for of in losses] == [False, False, False, True, True]
     assert losses[-1]["smooth_depth"].item() == pytest.approx(0.1 * 1.0 / 1.5)
     assert set(model.eval().get_loss_dict(outputs, batch)) == {"main_loss"}
+    with pytest.raises(ValueError, match="smooth_depth"):
+        make(smooth_depth=-0.1)
 
 
 def test_the_launchers_regularizer_beside_its_own_is_refused():
