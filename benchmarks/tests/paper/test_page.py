@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pages import ROOT
 
-from benchmarks.choices import BY_ANY_COLOR, BY_DEFAULT, BY_SMOOTH, BY_TODAYS, pairs_of
+from benchmarks.choices import BY_ANY_COLOR, BY_DEFAULT, BY_SMOOTH, BY_TODAYS, TWO_BY_TODAYS, pairs_of
 from benchmarks.paper import figure as figure_module
 from benchmarks.paper.cells import Grid, declared, estimate, is_done, rows_of
 from benchmarks.paper.claims import CLAIMS, Check, Claim, chosen
@@ -307,6 +307,23 @@ def test_what_the_recommended_setting_gained_is_what_was_measured():
         assert (count, len(started)) == (len(every), 9)
         assert mean == pytest.approx(np.mean(every), abs=0.051)
         assert -worst == pytest.approx(min(every), abs=0.0051)
+
+
+def test_what_two_models_gained_is_what_was_measured():
+    """The figures in docs/settings.md, and of one model in the same pairs, which are those of its first three seeds."""
+    rows = json.loads((ROOT / "benchmarks" / "data" / "setting.json").read_text("utf-8"))
+    two, one = (
+        [after - before for of in pairs_of(rows, titles, from_today).values() for before, after in of[:3]]
+        for titles in (TWO_BY_TODAYS, BY_TODAYS)
+    )
+    text = " ".join((ROOT / "docs" / "settings.md").read_text("utf-8").split())
+    said = re.search(
+        r"gained (\d\.\d\d) dB over plain trainings in (\d+) pairs \(one training (\d\.\d\d)\), at least (\d\.\d)", text
+    )
+    mean, count, single, least = map(float, said.groups())
+    assert (len(two), len(one)) == (count, count)
+    assert [mean, single] == pytest.approx([np.mean(two), np.mean(one)], abs=0.0051)
+    assert least == pytest.approx(min(two), abs=0.051)
 
 
 def test_what_opacity_decay_gained_is_what_was_measured():
