@@ -1,4 +1,4 @@
-"""The later choices of the setting for few photographs, by the rows of `benchmarks.setting`; see benchmarks/setting.md.
+"""The later choices of the setting for few photographs, by the rows of `benchmarks.setting`; see benchmarks/choices.md.
 
 python -m benchmarks.choices benchmarks/data/setting.json    # or quality.json
 """

@@ -1,4 +1,4 @@
-"""The study of failures, from the rows of `benchmarks.setting`; see benchmarks/setting.md.
+"""The study of failures, from the rows of `benchmarks.setting`; see benchmarks/failures.md.
 
 python -m benchmarks.failures benchmarks/data/setting.json
 """

@@ -1,4 +1,4 @@
-"""The mean of the parameters over the last steps of a training, under the protocol of benchmarks/setting.md.
+"""The mean of the parameters over the last steps of a training, under the protocol of benchmarks/choices.md.
 
     python -m benchmarks.last_steps train STARTS SCENE... --seeds 3 --out last_steps.json    # rows are kept
     python -m benchmarks.last_steps table last_steps.json

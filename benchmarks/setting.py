@@ -1,4 +1,4 @@
-"""The setting for few photographs: candidates by held-out views, the chosen one judged; see benchmarks/setting.md.
+"""The setting for few photographs: candidates by held-out views, the chosen one judged; see benchmarks/choices.md.
 
     python -m benchmarks.setting measure RUN... --out setting.json    # folders of runs; what is measured is kept
     python -m benchmarks.setting shared REFERENCE RUN... --out setting.json    # of one scene; their rows are there

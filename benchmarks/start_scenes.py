@@ -6,7 +6,7 @@
     python -m benchmarks.start_scenes cameras ../shared/data OUT SCENE...    # OUT/SCENE-own
     python -m benchmarks.start_scenes many ../shared/data OUT SCENE...       # OUT/SCENE-many, 14 or 16 photographs
 
-What comes of them is in benchmarks/dense_start.md and setting.md.
+What comes of them is in benchmarks/dense_start.md and choices.md.
 """
 
 from __future__ import annotations

@@ -16,6 +16,12 @@ def blocks(page: Path, language: str) -> list[str]:
     return [text for found, text in fenced_blocks(page) if found == language]
 
 
+def lines_missing(printed: str, *names: str) -> list[str]:
+    """Return the lines that a command has printed and none of these pages of the evidence has."""
+    there = {line for name in names for line in (ROOT / "benchmarks" / name).read_text("utf-8").splitlines()}
+    return [line for line in printed.splitlines() if line and line not in there]
+
+
 def broken_links(page: Path) -> list[str]:
     """Return the relative links of a page whose file, or whose heading in it, does not exist."""
     links = re.findall(r"(?:\]\(|^\[[\w-]+\]: )([^)\s]+)", page.read_text(encoding="utf-8"), re.MULTILINE)

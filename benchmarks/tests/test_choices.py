@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from statistics import fmean
 
 import pytest
+from pages import lines_missing
 
 from benchmarks import setting
 from benchmarks.choices import (
@@ -76,11 +76,9 @@ def test_settings_from_the_same_start_are_met_by_seeds_that_both_have():
 
 
 @pytest.mark.parametrize("name", ["setting.json", "quality.json"])
-def test_the_page_has_the_tables_of_its_rows(name):
-    lines = Path(setting.__file__).with_suffix(".md").read_text("utf-8").splitlines()
+def test_the_pages_have_the_tables_of_its_rows(name):
     rows = json.loads((setting.REFERENCES.parent / name).read_text("utf-8"))
-    for table in tables(rows):
-        assert [line for line in table.splitlines() if line and line not in lines] == []
+    assert lines_missing("\n".join(tables(rows)), "choices.md", "setting.md") == []
 
 
 def test_what_the_plan_says_of_one_exposure_is_what_was_measured():

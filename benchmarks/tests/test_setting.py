@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 from functools import partial
-from pathlib import Path
+
+from pages import lines_missing
 
 from benchmarks import setting
 from reference_trainer.evaluation.results import write_json
@@ -89,11 +90,8 @@ def test_a_control_is_what_the_later_beginning_gains_alone(tmp_path):
 
 
 def test_the_page_has_the_tables_of_its_rows():
-    page = Path(setting.__file__).with_suffix(".md").read_text("utf-8")
     rows = json.loads((setting.REFERENCES.parent / "setting.json").read_text("utf-8"))
-    lines = page.splitlines()
-    for table in setting.tables(rows):
-        assert [line for line in table.splitlines() if line and line not in lines] == []
+    assert lines_missing("\n".join(setting.tables(rows)), "choices.md") == []
 
 
 def test_the_recipe_is_what_was_chosen():

@@ -26,7 +26,7 @@ def member_settings(config: TrainConfig, number: int, of: int) -> TrainConfig:
     """Return the settings of a member from those of the first, number 0, of ``sparse``.
 
     The first learns from the others, which have seeds of their own and half of its steps; three have other settings as
-    well. benchmarks/setting.md chose both.
+    well. benchmarks/choices.md chose both.
 
     Example:
         >>> first = with_recipe("sparse", iterations=3_000)

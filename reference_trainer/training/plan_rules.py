@@ -284,7 +284,7 @@ def one_exposure(scene: Scene, config: TrainConfig) -> PlanItem:
 DENSE_GAINS = {"fern": 1.9, "herz-jesu": 1.0, "fountain": 0.7, "sceaux": 0.4, "cape": 0.3}
 """What a dense start added to COLMAP's points of the same photographs gained, dB: benchmarks/dense_start.md."""
 ONE_EXPOSURE_GAINS = {"herz-jesu": 0.0, "sceaux": 0.5}
-"""What one exposure gained there, dB, in the mean of six trainings: benchmarks/setting.md."""
+"""What one exposure gained there, dB, in the mean of six trainings: benchmarks/choices.md."""
 _BUILT_IN = "the built-in scene"
 DROPOUT_GAINS = {
     2: {("fern", 0.2): 1.4, (_BUILT_IN, 0.1): 1.7, (_BUILT_IN, 0.2): 1.7},

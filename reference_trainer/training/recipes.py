@@ -142,7 +142,7 @@ RECIPES: dict[str, Recipe] = {
         ),  # the schedule of 3dgs at 3,000 steps, but for the beginning of density control
         "no publication: 3dgs densified later, dropout (Chen et al. 2025), Binocular3DGS's opacity decay, CoR-GS's "
         "random background, Monodepth2's smoothness, our guard",
-        "nothing; benchmarks/setting.md says how it was chosen",
+        "nothing; benchmarks/choices.md says how it was chosen",
     ),
     "distilled": Recipe(
         TrainConfig(
