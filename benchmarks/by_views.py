@@ -1,0 +1,124 @@
+"""Two settings by the median of the views, which no single view decides; see choice 30 in benchmarks/choices.md.
+
+    python -m benchmarks.by_views measure RUN... --lpips lpips_vgg.pth --out by_views.json    # what is measured is kept
+    python -m benchmarks.by_views table by_views.json
+
+A row is a training: PSNR and LPIPS of every held-out view and of every test view, Gaussians, processor time.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from statistics import fmean, median
+from typing import Annotated, Any, Literal
+
+import torch
+import tyro
+
+from benchmarks.guard import held_out_views
+from benchmarks.paper.scenes import SCENES
+from benchmarks.setting import TODAY, candidate
+from reference_trainer.evaluation.lpips import LPIPS, load_lpips
+from reference_trainer.evaluation.metrics import on_white, view_psnr
+from reference_trainer.evaluation.results import write_json
+from reference_trainer.evaluation.tables import markdown_table
+from reference_trainer.json_files import read_json
+from reference_trainer.runs.folder import read_run_settings
+from reference_trainer.runs.measure import load_run_model
+
+__all__ = ["difference", "main", "measured", "table"]
+
+Row = dict[str, Any]
+"""``scene``, ``candidate`` and ``seed``; ``held-out`` and ``test``, the figures of each view by its name;
+``gaussians`` and ``seconds``."""
+_OVER: dict[str, Callable[[Iterable[float]], float]] = {"held-out": median, "test": fmean}
+"""What a scene's figure is of its views': by one veiled view of three nothing is chosen, and judged as ever."""
+_COLUMNS = {f"{split} {title}": (split, title.lower()) for split in _OVER for title in ("PSNR", "LPIPS")}
+_FORMS = {"psnr": "{:+.2f}", "lpips": "{:+.3f}"}
+
+
+def main(
+    what: Annotated[Literal["measure", "table"], tyro.conf.Positional],
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    out: Path = Path("runs/by_views.json"),
+    lpips: Path | None = None,
+) -> None:
+    """Measure runs, or print the tables of what was measured.
+
+    Args:
+        what: "measure" or "table".
+        paths: folders of runs, or one file of rows.
+        out: the file of rows, which is continued.
+        lpips: weights of the perceptual metric, which measuring needs.
+    """
+    if what == "table":
+        print(table(json.loads(paths[0].read_text("utf-8"))))
+        return
+    torch.set_num_threads(1)
+    perceptual = load_lpips(lpips)
+    if perceptual is None:
+        raise ValueError("LPIPS is half of what is measured: give its weights, --lpips FILE.")
+    rows: list[Row] = json.loads(out.read_text("utf-8")) if out.exists() else []
+    known = {(row["scene"], row["candidate"], row["seed"]) for row in rows}
+    for run in paths:
+        options, config = read_run_settings(run / "config.json")
+        if (Path(options.path).name, candidate(config), config.seed) not in known:
+            rows.append(measured(run, perceptual))
+            write_json(out, rows)
+            print(run.name, flush=True)
+
+
+def measured(run: Path, perceptual: LPIPS) -> Row:
+    """Return the row of a finished training."""
+    model, scene = load_run_model(run)
+    options, config = read_run_settings(run / "config.json")
+    row: Row = {"scene": Path(options.path).name, "candidate": candidate(config), "seed": config.seed}
+    for split, views in {"held-out": held_out_views(options, config.seed), "test": scene.test}.items():
+        row[split] = {"psnr": {}, "lpips": {}}
+        for view in views:
+            image = model.test_rendering(view).image.clamp(0, 1)
+            row[split]["psnr"][view.name] = view_psnr(image, view)
+            row[split]["lpips"][view.name] = perceptual(on_white(image, view.mask), on_white(view.image, view.mask))
+    results = read_json(run / "results.json")
+    return row | {
+        "gaussians": results["gaussians"],
+        "seconds": results["processor_seconds"],
+        "cpu": results["machine"]["cpu"],
+    }
+
+
+def difference(before: Sequence[Row], after: Sequence[Row], split: str, figure: str) -> float:
+    """Return what a figure changes by on a scene: of each view the mean over the seeds, of these what `_OVER` says."""
+    views = before[0][split][figure]
+    old, new = ([fmean(row[split][figure][name] for row in rows) for name in views] for rows in (before, after))
+    return _OVER[split](b - a for a, b in zip(old, new, strict=True))
+
+
+def table(rows: Sequence[Row], reference: str = TODAY) -> str:
+    """Return a table for each candidate: what it changes on each scene by the seeds that both have."""
+    tables = []
+    for name in dict.fromkeys(row["candidate"] for row in rows if row["candidate"] != reference):
+        lines, changes = [], defaultdict[str, list[float]](list)
+        for scene in SCENES:
+            of = [{r["seed"]: r for r in rows if (r["scene"], r["candidate"]) == (scene, x)} for x in (reference, name)]
+            if not (seeds := sorted(of[0].keys() & of[1].keys())):
+                continue
+            before, after = ([x[seed] for seed in seeds] for x in of)
+            line = {"scene": scene, "seeds": str(len(seeds))}
+            for title, (split, figure) in _COLUMNS.items():
+                changes[title].append(difference(before, after, split, figure))
+                line[title] = _FORMS[figure].format(changes[title][-1])
+            for figure in ("gaussians", "seconds"):
+                line[figure] = f"{fmean(r[figure] for r in after) / fmean(r[figure] for r in before):.2f}"
+            lines.append(line)
+        mean = {title: _FORMS[figure].format(fmean(changes[title])) for title, (_, figure) in _COLUMNS.items()}
+        last = dict.fromkeys(lines[0], "-") | {"scene": "mean"} | mean
+        tables.append(f"{name}:\n\n{markdown_table([*lines, last], [*last])}")
+    return "\n".join(tables)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,26 @@
+"""What a candidate changes by the median of the views: from rows made by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from benchmarks.by_views import difference, table
+
+
+def row(candidate: str, seed: int, held_out: list[float], test: list[float]) -> dict[str, Any]:
+    """Return a row of fern; LPIPS is a hundredth of PSNR."""
+    psnr = {split: dict(zip("abc", of, strict=False)) for split, of in (("held-out", held_out), ("test", test))}
+    splits = {split: {"psnr": of, "lpips": {x: y / 100 for x, y in of.items()}} for split, of in psnr.items()}
+    return {"scene": "fern", "candidate": candidate, "seed": seed, "gaussians": 10, "seconds": 2.0} | splits
+
+
+def test_one_view_of_three_does_not_choose_but_counts_where_it_judges():
+    before = [row("before", 0, [20.0, 20.0, 20.0], [30.0, 30.0]), row("before", 1, [22.0, 20.0, 20.0], [32.0, 30.0])]
+    after = [row("after", 0, [22.0, 21.0, 10.0], [31.0, 30.0]), row("after", 1, [22.0, 21.0, 10.0], [31.0, 20.0])]
+    assert difference(before, after, "held-out", "psnr") == pytest.approx(1.0)
+    assert difference(before, after, "test", "psnr") == pytest.approx(-2.5)
+    after += [row("after", 2, [50.0] * 3, [50.0] * 2)]  # a seed that the reference lacks
+    cells = [x.strip() for x in table([*before, *after], "before").splitlines()[4].split("|")[1:-1]]
+    assert cells == ["fern", "2", "+1.00", "+0.010", "-2.50", "-0.025", "1.00", "1.00"]
