@@ -16,7 +16,7 @@ import json
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Literal
@@ -49,7 +49,6 @@ __all__ = [
     "judging",
     "main",
     "measured",
-    "recommended",
     "references_of",
     "rows_of",
     "second",
@@ -376,22 +375,10 @@ def _against_first(rows: Sequence[Row], chosen: str, scenes: Sequence[str]) -> s
     )
 
 
-def recommended(rows: Sequence[Row], references: Path = REFERENCES) -> dict[str, list[float]]:
-    """Return by how much the recommended setting is ahead, as `differences` does.
-
-    Both begin with the points that are declared for the paper's grid; lego, for which those are random, with the dense
-    start that it has by default.
-    """
-    (lego,) = differences(rows, references, chosen=LATER, names=("lego, dense",)).values()
-    return differences(rows, references, chosen=LATER) | {"lego": lego}
-
-
-def differences(
-    rows: Sequence[Row], references: Path = REFERENCES, *, chosen: str = CHOSEN, names: Iterable[str] = SCENES
-) -> dict[str, list[float]]:
+def differences(rows: Sequence[Row], references: Path = REFERENCES, *, chosen: str = CHOSEN) -> dict[str, list[float]]:
     """Return by how much a setting is ahead of the plain training of the same seed, test PSNR, by scene."""
     found: dict[str, list[float]] = {}
-    for scene in names:
+    for scene in SCENES:
         own, plain = rows_of(rows, scene, chosen), references_of(rows, references, scene)["plain"]
         if shared := sorted(own.keys() & plain.keys() & set(range(SEEDS))):
             found[scene] = [value(own[seed], "test psnr") - value(plain[seed], "test psnr") for seed in shared]

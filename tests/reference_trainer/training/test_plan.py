@@ -144,13 +144,13 @@ def test_left_out_by_construction(tiny_scene, name, config, said):
     [
         (1, 0.0, TrainConfig(), "recommended", r"^not asked for; 1 view; with 2 views .* by \+1\.4 to \+1\.7 dB"),
         (3, 20.0, TrainConfig(), "recommended", r"3 views, 20 degrees apart; with 3 views .* \+0\.5 to \+1\.8 dB"),
-        (3, 20.0, TrainConfig(), "recommended", r"single trainings of 6 scenes.*--recipe sparse$"),
+        (3, 20.0, TrainConfig(), "recommended", r"single trainings of 6 scenes\): use --recipe sparse$"),
         (
             4,
             30.0,
             TrainConfig(),
             "recommended",
-            r"30 degrees apart; .* by -0\.1 to \+0\.4 dB .* 3 scenes .*--recipe",
+            r"30 degrees apart; .* by -0\.1 to \+0\.4 dB .* 3 scenes\): use --recipe",
         ),
         (
             11,
