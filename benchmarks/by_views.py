@@ -29,7 +29,7 @@ from reference_trainer.json_files import read_json
 from reference_trainer.runs.folder import read_run_settings
 from reference_trainer.runs.measure import load_run_model
 
-__all__ = ["difference", "main", "measured", "table"]
+__all__ = ["difference", "main", "measured", "table", "tables"]
 
 Row = dict[str, Any]
 """``scene``, ``candidate`` and ``seed``; ``held-out`` and ``test``, the figures of each view by its name;
@@ -37,6 +37,7 @@ Row = dict[str, Any]
 _OVER: dict[str, Callable[[Iterable[float]], float]] = {"held-out": median, "test": fmean}
 """What a scene's figure is of its views': by one veiled view of three nothing is chosen, and judged as ever."""
 _COLUMNS = {f"{split} {title}": (split, title.lower()) for split in _OVER for title in ("PSNR", "LPIPS")}
+_RATIOS = {"Gaussians": "gaussians", "processor time": "seconds"}
 _FORMS = {"psnr": "{:+.2f}", "lpips": "{:+.3f}"}
 
 
@@ -55,7 +56,7 @@ def main(
         lpips: weights of the perceptual metric, which measuring needs.
     """
     if what == "table":
-        print(table(json.loads(paths[0].read_text("utf-8"))))
+        print(*tables(json.loads(paths[0].read_text("utf-8"))), sep="\n\n")
         return
     torch.set_num_threads(1)
     perceptual = load_lpips(lpips)
@@ -80,8 +81,9 @@ def measured(run: Path, perceptual: LPIPS) -> Row:
         row[split] = {"psnr": {}, "lpips": {}}
         for view in views:
             image = model.test_rendering(view).image.clamp(0, 1)
-            row[split]["psnr"][view.name] = view_psnr(image, view)
-            row[split]["lpips"][view.name] = perceptual(on_white(image, view.mask), on_white(view.image, view.mask))
+            pair = on_white(image, view.mask), on_white(view.image, view.mask)
+            row[split]["psnr"][view.name] = round(view_psnr(image, view), 4)
+            row[split]["lpips"][view.name] = round(perceptual(*pair), 5)
     results = read_json(run / "results.json")
     return row | {
         "gaussians": results["gaussians"],
@@ -97,27 +99,35 @@ def difference(before: Sequence[Row], after: Sequence[Row], split: str, figure: 
     return _OVER[split](b - a for a, b in zip(old, new, strict=True))
 
 
-def table(rows: Sequence[Row], reference: str = TODAY) -> str:
-    """Return a table for each candidate: what it changes on each scene by the seeds that both have."""
-    tables = []
-    for name in dict.fromkeys(row["candidate"] for row in rows if row["candidate"] != reference):
-        lines, changes = [], defaultdict[str, list[float]](list)
-        for scene in SCENES:
-            of = [{r["seed"]: r for r in rows if (r["scene"], r["candidate"]) == (scene, x)} for x in (reference, name)]
-            if not (seeds := sorted(of[0].keys() & of[1].keys())):
-                continue
-            before, after = ([x[seed] for seed in seeds] for x in of)
-            line = {"scene": scene, "seeds": str(len(seeds))}
-            for title, (split, figure) in _COLUMNS.items():
-                changes[title].append(difference(before, after, split, figure))
-                line[title] = _FORMS[figure].format(changes[title][-1])
-            for figure in ("gaussians", "seconds"):
-                line[figure] = f"{fmean(r[figure] for r in after) / fmean(r[figure] for r in before):.2f}"
-            lines.append(line)
-        mean = {title: _FORMS[figure].format(fmean(changes[title])) for title, (_, figure) in _COLUMNS.items()}
-        last = dict.fromkeys(lines[0], "-") | {"scene": "mean"} | mean
-        tables.append(f"{name}:\n\n{markdown_table([*lines, last], [*last])}")
-    return "\n".join(tables)
+def tables(rows: Sequence[Row]) -> list[str]:
+    """Return a table of what the recipe changes over plain trainings, and one of what each candidate does over it."""
+    names = dict.fromkeys(row["candidate"] for row in rows if row["candidate"] != TODAY)
+    return [table(rows, name, TODAY) if name == "plain" else table(rows, TODAY, name) for name in names]
+
+
+def table(rows: Sequence[Row], *names: str) -> str:
+    """Return a table of what the second of two settings changes on each scene, by the seeds that both have."""
+    lines, changes, pairs = [], defaultdict[str, list[float]](list), list[float]()
+    for scene in SCENES:
+        of = [{r["seed"]: r for r in rows if (r["scene"], r["candidate"]) == (scene, name)} for name in names]
+        seeds = sorted(of[0].keys() & of[1].keys())
+        if not seeds:
+            continue
+        before, after = ([each[seed] for seed in seeds] for each in of)
+        pairs += [difference([a], [b], "test", "psnr") for a, b in zip(before, after, strict=True)]
+        line = {"scene": scene, "seeds": str(len(seeds))}
+        for title, (split, figure) in _COLUMNS.items():
+            changes[title].append(difference(before, after, split, figure))
+            line[title] = _FORMS[figure].format(changes[title][-1])
+        for title, figure in _RATIOS.items():
+            line[title] = f"{fmean(r[figure] for r in after) / fmean(r[figure] for r in before):.2f}"
+        lines.append(line)
+    mean = {title: _FORMS[figure].format(fmean(changes[title])) for title, (_, figure) in _COLUMNS.items()}
+    last = dict.fromkeys(lines[0], "-") | {"scene": "mean"} | mean
+    return (
+        f"{names[1]} over {names[0]}:\n\n{markdown_table([*lines, last], [*last])}\n"
+        f"- test PSNR, {len(pairs)} pairs: {min(pairs):+.2f} to {max(pairs):+.2f} dB, {fmean(pairs):+.2f} in the mean"
+    )
 
 
 if __name__ == "__main__":

@@ -22,5 +22,5 @@ def test_one_view_of_three_does_not_choose_but_counts_where_it_judges():
     assert difference(before, after, "held-out", "psnr") == pytest.approx(1.0)
     assert difference(before, after, "test", "psnr") == pytest.approx(-2.5)
     after += [row("after", 2, [50.0] * 3, [50.0] * 2)]  # a seed that the reference lacks
-    cells = [x.strip() for x in table([*before, *after], "before").splitlines()[4].split("|")[1:-1]]
+    cells = [x.strip() for x in table([*before, *after], "before", "after").splitlines()[4].split("|")[1:-1]]
     assert cells == ["fern", "2", "+1.00", "+0.010", "-2.50", "-0.025", "1.00", "1.00"]
