@@ -84,6 +84,8 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "flat": ("loss", "flat("),
     "D-SSIM 0.4": ("loss", "photometric(0.4)"),
     "threshold 7e-4": ("densify_gradient", 7e-4),
+    "score 3": ("loss", "co_adaptation(between(3.0,"),
+    "score 1": ("loss", "co_adaptation(between(1.0,"),
     "needles": ("loss", "Needles(0.02,"),
     "needles, weakly": ("loss", "Needles(0.002,"),
     "absgrad": ("density", "absgrad"),
