@@ -124,8 +124,9 @@ def table(rows: Sequence[Row], *names: str) -> str:
         lines.append(line)
     mean = {title: _FORMS[figure].format(fmean(changes[title])) for title, (_, figure) in _COLUMNS.items()}
     last = dict.fromkeys(lines[0], "-") | {"scene": "mean"} | mean
+    former, latter = (x.removeprefix(f"{TODAY} + ").replace(TODAY, "recipe") for x in names)
     return (
-        f"{names[1]} over {names[0]}:\n\n{markdown_table([*lines, last], [*last])}\n"
+        f"{latter} over {former}:\n\n{markdown_table([*lines, last], [*last])}\n"
         f"- test PSNR, {len(pairs)} pairs: {min(pairs):+.2f} to {max(pairs):+.2f} dB, {fmean(pairs):+.2f} in the mean"
     )
 

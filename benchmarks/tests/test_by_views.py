@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import pytest
+from pages import ROOT, lines_missing
 
-from benchmarks.by_views import difference, table
+from benchmarks.by_views import difference, table, tables
 
 
 def row(candidate: str, seed: int, held_out: list[float], test: list[float]) -> dict[str, Any]:
@@ -24,3 +26,8 @@ def test_one_view_of_three_does_not_choose_but_counts_where_it_judges():
     after += [row("after", 2, [50.0] * 3, [50.0] * 2)]  # a seed that the reference lacks
     cells = [x.strip() for x in table([*before, *after], "before", "after").splitlines()[4].split("|")[1:-1]]
     assert cells == ["fern", "2", "+1.00", "+0.010", "-2.50", "-0.025", "1.00", "1.00"]
+
+
+def test_the_page_has_the_tables_of_its_rows():
+    rows = json.loads((ROOT / "benchmarks" / "data" / "by_views.json").read_text("utf-8"))
+    assert lines_missing("\n".join(tables(rows)), "choices.md") == []
