@@ -33,9 +33,9 @@ __all__ = ["difference", "main", "measured", "table", "tables"]
 
 Row = dict[str, Any]
 """``scene``, ``candidate`` and ``seed``; ``held-out`` and ``test``, the figures of each view by its name;
-``gaussians`` and ``seconds``."""
+``gaussians``, ``seconds`` and ``cpu``."""
 _OVER: dict[str, Callable[[Iterable[float]], float]] = {"held-out": median, "test": fmean}
-"""What a scene's figure is of its views': by one veiled view of three nothing is chosen, and judged as ever."""
+"""What makes the figure of a scene from those of its views: one veiled view of three shall not choose."""
 _COLUMNS = {f"{split} {title}": (split, title.lower()) for split in _OVER for title in ("PSNR", "LPIPS")}
 _RATIOS = {"Gaussians": "gaussians", "processor time": "seconds"}
 _FORMS = {"psnr": "{:+.2f}", "lpips": "{:+.3f}"}
