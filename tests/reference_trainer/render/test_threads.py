@@ -128,6 +128,7 @@ def test_after_ctrl_c_nothing_is_written(times):
     assert len(written) == count
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of one during garbage collection
 def test_renders_go_on_after_ctrl_c_at_any_time():
     torch.set_num_threads(3)
     scene = random_scene(3000, 160, 120, seed=3, size=0.04).to(torch.float32)
