@@ -3,7 +3,8 @@
     python -m benchmarks.by_views measure RUN... --lpips lpips_vgg.pth --out by_views.json    # what is measured is kept
     python -m benchmarks.by_views table by_views.json
 
-A row is a training: PSNR and LPIPS of every held-out view and of every test view, Gaussians, processor time.
+A row is a training: PSNR and LPIPS of every held-out view and of every test view, Gaussians, processor time. The names
+of the settings do not tell how many steps were trained: those of one file are the same.
 """
 
 from __future__ import annotations
@@ -105,15 +106,17 @@ def tables(rows: Sequence[Row]) -> list[str]:
     return [table(rows, name, TODAY) if name == "plain" else table(rows, TODAY, name) for name in names]
 
 
-def table(rows: Sequence[Row], *names: str) -> str:
-    """Return a table of what the second of two settings changes on each scene, by the seeds that both have."""
+def table(rows: Sequence[Row], former: str, latter: str) -> str:
+    """Return a table of what the latter of two settings changes on each scene, by the seeds that both have."""
     lines, changes, pairs = [], defaultdict[str, list[float]](list), list[float]()
     for scene in SCENES:
-        of = [{r["seed"]: r for r in rows if (r["scene"], r["candidate"]) == (scene, name)} for name in names]
-        seeds = sorted(of[0].keys() & of[1].keys())
+        old, new = (
+            {r["seed"]: r for r in rows if (r["scene"], r["candidate"]) == (scene, name)} for name in (former, latter)
+        )
+        seeds = sorted(old.keys() & new.keys())
         if not seeds:
             continue
-        before, after = ([each[seed] for seed in seeds] for each in of)
+        before, after = ([of[seed] for seed in seeds] for of in (old, new))
         pairs += [difference([a], [b], "test", "psnr") for a, b in zip(before, after, strict=True)]
         line = {"scene": scene, "seeds": str(len(seeds))}
         for title, (split, figure) in _COLUMNS.items():
@@ -124,9 +127,9 @@ def table(rows: Sequence[Row], *names: str) -> str:
         lines.append(line)
     mean = {title: _FORMS[figure].format(fmean(changes[title])) for title, (_, figure) in _COLUMNS.items()}
     last = dict.fromkeys(lines[0], "-") | {"scene": "mean"} | mean
-    former, latter = (x.removeprefix(f"{TODAY} + ").replace(TODAY, "recipe") for x in names)
+    titles = [x.removeprefix(f"{TODAY} + ").replace(TODAY, "recipe") for x in (latter, former)]
     return (
-        f"{latter} over {former}:\n\n{markdown_table([*lines, last], [*last])}\n"
+        f"{' over '.join(titles)}:\n\n{markdown_table([*lines, last], [*last])}\n"
         f"- test PSNR, {len(pairs)} pairs: {min(pairs):+.2f} to {max(pairs):+.2f} dB, {fmean(pairs):+.2f} in the mean"
     )
 
