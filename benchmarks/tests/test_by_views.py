@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import pytest
 from pages import ROOT, lines_missing
 
 from benchmarks.by_views import difference, table, tables
+from benchmarks.setting import TODAY
 
 
 def row(candidate: str, seed: int, held_out: list[float], test: list[float]) -> dict[str, Any]:
@@ -31,3 +33,18 @@ def test_one_view_of_three_does_not_choose_but_counts_where_it_judges():
 def test_the_page_has_the_tables_of_its_rows():
     rows = json.loads((ROOT / "benchmarks" / "data" / "by_views.json").read_text("utf-8"))
     assert lines_missing("\n".join(tables(rows)), "choices.md") == []
+
+
+def test_what_the_recipe_gains_as_run_trains_is_what_was_measured():
+    """The figures in docs/settings.md against the rows, of single trainings of the six scenes."""
+    rows = json.loads((ROOT / "benchmarks" / "data" / "by_views.json").read_text("utf-8"))
+    plain, own = ({r["scene"]: r for r in rows if (r["candidate"], r["seed"]) == (x, 0)} for x in ("plain", TODAY))
+    gains, sharpness = (
+        [difference([plain[scene]], [own[scene]], "test", figure) for scene in plain] for figure in ("psnr", "lpips")
+    )
+    text = " ".join((ROOT / "docs" / "settings.md").read_text("utf-8").split())
+    said = re.search(r"six gained (\S+) to (\S+) dB over plain ones, (\S+) in .*?LPIPS (\S+) higher", text)
+    least, most, mean, blur = map(float, said.groups())
+    assert len(gains) == 6
+    assert [least, most, mean] == pytest.approx([min(gains), max(gains), sum(gains) / 6], abs=0.051)
+    assert blur == pytest.approx(sum(sharpness) / 6, abs=0.00051)
