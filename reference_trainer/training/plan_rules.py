@@ -310,7 +310,8 @@ SPARSE_GAINS = {
     _BUILT_IN: (1.7, 3.0),
 }  # fmt: skip
 """What ``--recipe sparse``, with one exposure or without, changed PSNR by against a plain training, with 3 views: the
-least and the largest difference of two trainings with one seed and one dense start, dB, from benchmarks/setting.md."""
+least and the largest difference of two trainings with one seed and one dense start (of the built-in scene its own
+points), dB, from benchmarks/setting.md."""
 SPARSE_GAINS_FAR_APART = {"DTU scan24": (1.4, 1.6), "DTU scan65": (0.6, 1.2), "lego": (0.8, 0.9)}
 """The same where views are far apart, with 3, 3 and 8 views."""
 
