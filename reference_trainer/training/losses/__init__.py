@@ -9,7 +9,7 @@ from ca_reg.schedules import SCHEDULES
 from reference_trainer.training.losses.comparisons import CoAdaptation, Consistency, CoRegularization, StraightThrough
 from reference_trainer.training.losses.depth import PatchDepth, Pearson, SmoothDepth, Warp
 from reference_trainer.training.losses.distillation import Distillation
-from reference_trainer.training.losses.penalties import Alpha, Flat, Opacity, Scale
+from reference_trainer.training.losses.penalties import Alpha, Flat, Opacity, RayExtent, Scale
 from reference_trainer.training.losses.photometric import Photometric, Views
 from reference_trainer.training.losses.term import LossTerm
 
@@ -28,6 +28,7 @@ LOSSES: Registry[LossTerm] = Registry(
     alpha=Alpha,
     flat=Flat,
     scale=Scale,
+    ray_extent=RayExtent,
     opacity=Opacity,
     co_adaptation=CoAdaptation,
     consistency=Consistency,

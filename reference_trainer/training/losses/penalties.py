@@ -8,11 +8,12 @@ from torch.nn.functional import max_pool2d, pad
 
 from ca_reg._check import check_finite
 from ca_reg.schedules import Schedule
+from reference_trainer.rotations import rotations
 from reference_trainer.scenes.scene import Scene, View
 from reference_trainer.training.losses.term import WeightedTerm
 from reference_trainer.training.step import Step
 
-__all__ = ["Alpha", "Flat", "Opacity", "Scale", "dark_background"]
+__all__ = ["Alpha", "Flat", "Opacity", "RayExtent", "Scale", "dark_background", "ray_extents"]
 
 _ROWS = 49
 
@@ -122,6 +123,57 @@ class Scale(WeightedTerm):
         scales = step.params.scales
         assert scales is not None
         return (scales.amax(1) - self.limit).clamp_min(0).square().mean()
+
+
+class RayExtent(WeightedTerm):
+    """``weight * sum(max(r - limit, 0))`` over the Gaussians in front of the step's camera, r their `ray_extents`.
+
+    No photograph can tell how far something extends along its rays. What does so by a good part of its distance is a
+    few pixels there, and a veil before a camera beside. Shapes learn from this, positions do not.
+
+    Args:
+        weight: at least 0, or a schedule; a sum, so that the number of Gaussians does not matter.
+        limit: extent up to which nothing is penalized, above 0.
+    """
+
+    analytic = True
+
+    def __init__(self, weight: float | Schedule = 0.01, limit: float = 0.05) -> None:
+        super().__init__(weight)
+        if not 0 < limit < float("inf"):
+            raise ValueError(f"limit must be positive and finite, got {limit}.")
+        self.limit = limit
+
+    def value(self, step: Step) -> Tensor:
+        """Return the sum of the excesses."""
+        means, scales, quaternions = step.params.means, step.params.scales, step.params.quaternions
+        assert means is not None
+        assert scales is not None
+        assert quaternions is not None
+        camera = step.view.camera
+        offsets = means.detach() - camera.position
+        asked = offsets @ camera.world_to_camera[2, :3] > 0
+        if not means.is_cuda:  # most are too small to reach the limit; on a card, choosing them would be a wait
+            chosen = asked & (scales.detach().amax(1) > self.limit * offsets.norm(dim=1))
+            offsets, scales, quaternions = offsets[chosen], scales[chosen], quaternions[chosen]
+            asked = asked[chosen]
+        return (asked * (ray_extents(offsets, scales, quaternions) - self.limit).clamp_min(0)).sum()
+
+
+def ray_extents(offsets: Tensor, scales: Tensor, quaternions: Tensor) -> Tensor:
+    """Return the standard deviation of every Gaussian along the ray through its center, by its distance: (N,).
+
+    The centers are ``offsets`` (N, 3) from the camera; scales are (N, 3), quaternions (N, 4), wxyz.
+
+    Example:
+        >>> import torch
+        >>> offsets, scales = torch.tensor([[0.0, 0.0, 4.0]]), torch.tensor([[0.1, 0.2, 1.0]])
+        >>> ray_extents(offsets, scales, torch.tensor([[1.0, 0.0, 0.0, 0.0]])).item()
+        0.25
+    """
+    distances = offsets.norm(dim=1)
+    along = (rotations(quaternions) * (offsets.T / distances)[:, None]).sum(0)
+    return (along * scales.T).norm(dim=0) / distances
 
 
 class Opacity(WeightedTerm):
