@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from reference_trainer.training.losses import LOSSES
-from reference_trainer.training.losses.penalties import Alpha, Flat, Opacity, Scale, dark_background
+from reference_trainer.training.losses.penalties import Alpha, Flat, Opacity, RayExtent, Scale, dark_background
 
 
 def literal_background(image, threshold):
@@ -111,6 +112,36 @@ def test_gradients_of_scale(assert_gradients_of_differences):
 
 def test_arguments_of_scale():
     for text, message in (("scale(-1.0)", "weight must"), ("scale(1.0, -0.5)", "limit must be finite and at least 0")):
+        with pytest.raises(ValueError, match=message):
+            LOSSES.make(text)
+
+
+@pytest.mark.parametrize("limit", [1e-9, 0.1, 1e6])
+def test_it_is_the_excess_of_the_deviation_along_the_ray_by_the_distance(six, take_step, limit):
+    """By the covariance, u' C u, with SciPy's rotations; one of the six stands behind the camera."""
+    means = six.means.clone()
+    means[2, 2] = -3.0
+    step, scales = take_step(means=means), np.exp(six.log_scales.numpy())
+    axes = Rotation.from_quat(six.quaternions.numpy(), scalar_first=True).as_matrix()
+    pose = step.view.camera.world_to_camera.numpy()
+    offsets = means.numpy() + pose[:3, :3].T @ pose[:3, 3]
+    extents = [
+        np.sqrt(u @ (r * s**2) @ r.T @ u) / (u @ u)
+        for u, r, s in zip(offsets, axes, scales, strict=True)
+        if (pose[:3, :3] @ u)[2] > 0
+    ]
+    assert len(extents) == 5
+    expected = 0.3 * sum(max(extent - limit, 0) for extent in extents)
+    assert RayExtent(0.3, limit)(step).item() == pytest.approx(expected, rel=1e-12)
+    assert (expected > 0) == (limit < 1)
+
+
+def test_gradients_of_ray_extent(assert_gradients_of_differences):
+    assert_gradients_of_differences(RayExtent(0.3, 0.02), "log_scales", "quaternions")
+
+
+def test_arguments_of_ray_extent():
+    for text, message in (("ray_extent(-1.0)", "weight must"), ("ray_extent(1.0, 0.0)", "limit must be positive")):
         with pytest.raises(ValueError, match=message):
             LOSSES.make(text)
 

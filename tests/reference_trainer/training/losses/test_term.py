@@ -70,7 +70,8 @@ def test_a_weight_of_ssim_out_of_range_is_refused(name):
 @pytest.mark.parametrize(
     "term",
     ["pearson(0.5, None)", "patch_depth", "patch_depth(which='hard') + patch_depth(which='soft')", "warp(smooth=0.1)",
-     "smooth_depth(0.1)", "alpha(dark=1.0)", "views(2)", "flat(0.1)", "scale(1.0)", "opacity(0.1, 0.2)"],
+     "smooth_depth(0.1)", "alpha(dark=1.0)", "views(2)", "flat(0.1)", "scale(1.0)",
+     "ray_extent(1.0, 1e-3)", "opacity(0.1, 0.2)"],
 )  # fmt: skip
 def test_every_term_trains_beside_dropout(tiny_scene, term):
     views = tuple(dataclasses.replace(view, depth_prior=view.depth) for view in tiny_scene.train)
