@@ -76,6 +76,8 @@ _SECOND: dict[str, tuple[str, Any]] = {
     "smooth 0.1": ("loss", "smooth_depth(between(0.1,"),
     "smooth 0.5": ("loss", "smooth_depth(between(0.5,"),
     "early": ("loss", "smooth_depth(between(0.1,0))"),
+    "extent 0.05": ("loss", "ray_extent(0.01, limit=0.05)"),
+    "extent 0.1": ("loss", "ray_extent(0.01, limit=0.1)"),
     "warp": ("loss", "warp("),
     "hidden left out": ("loss", "hidden="),
     "every second step": ("loss", "every=2"),
