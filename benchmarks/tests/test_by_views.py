@@ -30,8 +30,9 @@ def test_one_view_of_three_does_not_choose_but_counts_where_it_judges():
     assert cells == ["fern", "2", "+1.00", "+0.010", "-2.50", "-0.025", "1.00", "1.00"]
 
 
-def test_the_page_has_the_tables_of_its_rows():
-    rows = json.loads((ROOT / "benchmarks" / "data" / "by_views.json").read_text("utf-8"))
+@pytest.mark.parametrize("name", ["by_views", "ray_extent_first", "ray_extent"])
+def test_the_page_has_the_tables_of_its_rows(name):
+    rows = json.loads((ROOT / "benchmarks" / "data" / f"{name}.json").read_text("utf-8"))
     assert lines_missing("\n".join(tables(rows)), "choices.md") == []
 
 

@@ -138,7 +138,7 @@ class RayExtent(WeightedTerm):
 
     analytic = True
 
-    def __init__(self, weight: float | Schedule = 0.01, limit: float = 0.05) -> None:
+    def __init__(self, weight: float | Schedule = 0.01, limit: float = 0.1) -> None:
         super().__init__(weight)
         if not 0 < limit < float("inf"):
             raise ValueError(f"limit must be positive and finite, got {limit}.")
@@ -163,7 +163,7 @@ class RayExtent(WeightedTerm):
 def ray_extents(offsets: Tensor, scales: Tensor, quaternions: Tensor) -> Tensor:
     """Return the standard deviation of every Gaussian along the ray through its center, by its distance: (N,).
 
-    The centers are ``offsets`` (N, 3) from the camera; scales are (N, 3), quaternions (N, 4), wxyz.
+    The centers are ``offsets`` (N, 3) from the camera; scales are (N, 3), quaternions (N, 4), wxyz. 0 at the camera.
 
     Example:
         >>> import torch
@@ -171,9 +171,10 @@ def ray_extents(offsets: Tensor, scales: Tensor, quaternions: Tensor) -> Tensor:
         >>> ray_extents(offsets, scales, torch.tensor([[1.0, 0.0, 0.0, 0.0]])).item()
         0.25
     """
-    distances = offsets.norm(dim=1)
+    distances = offsets.norm(dim=1).clamp_min(1e-30)
     along = (rotations(quaternions) * (offsets.T / distances)[:, None]).sum(0)
-    return (along * scales.T).norm(dim=0) / distances
+    extents: Tensor = (along * scales.T).norm(dim=0) / distances
+    return extents
 
 
 class Opacity(WeightedTerm):

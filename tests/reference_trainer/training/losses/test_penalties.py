@@ -8,7 +8,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from reference_trainer.training.losses import LOSSES
-from reference_trainer.training.losses.penalties import Alpha, Flat, Opacity, RayExtent, Scale, dark_background
+from reference_trainer.training.losses.penalties import (
+    Alpha,
+    Flat,
+    Opacity,
+    RayExtent,
+    Scale,
+    dark_background,
+    ray_extents,
+)
 
 
 def literal_background(image, threshold):
@@ -134,6 +142,14 @@ def test_it_is_the_excess_of_the_deviation_along_the_ray_by_the_distance(six, ta
     expected = 0.3 * sum(max(extent - limit, 0) for extent in extents)
     assert RayExtent(0.3, limit)(step).item() == pytest.approx(expected, rel=1e-12)
     assert (expected > 0) == (limit < 1)
+
+
+def test_a_gaussian_at_the_camera_has_no_extent_and_no_gradient():
+    scales = torch.ones(1, 3, requires_grad=True)
+    extents = ray_extents(torch.zeros(1, 3), scales, torch.tensor([[1.0, 0.0, 0.0, 0.0]]))
+    (gradient,) = torch.autograd.grad(extents.sum(), scales)
+    assert extents.item() == 0
+    assert torch.equal(gradient, torch.zeros(1, 3))
 
 
 def test_gradients_of_ray_extent(assert_gradients_of_differences):
