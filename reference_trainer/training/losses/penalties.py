@@ -152,12 +152,11 @@ class RayExtent(WeightedTerm):
         assert quaternions is not None
         camera = step.view.camera
         offsets = means.detach() - camera.position
-        asked = offsets @ camera.world_to_camera[2, :3] > 0
-        if not means.is_cuda:  # most are too small to reach the limit; on a card, choosing them would be a wait
-            chosen = asked & (scales.detach().amax(1) > self.limit * offsets.norm(dim=1))
-            offsets, scales, quaternions = offsets[chosen], scales[chosen], quaternions[chosen]
-            asked = asked[chosen]
-        return (asked * (ray_extents(offsets, scales, quaternions) - self.limit).clamp_min(0)).sum()
+        asked = offsets @ camera.forward > 0
+        # Most are too small to reach the limit; on a card, choosing the others would be a wait.
+        long = slice(None) if means.is_cuda else scales.detach().amax(1) > self.limit * offsets.norm(dim=1)
+        extents = ray_extents(offsets[long], scales[long], quaternions[long])
+        return (asked[long] * (extents - self.limit).clamp_min(0)).sum()
 
 
 def ray_extents(offsets: Tensor, scales: Tensor, quaternions: Tensor) -> Tensor:
